@@ -81,8 +81,14 @@ class Examiner:
 
     def complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
+        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
+        of_run = known.target, known.scales, self.tau, known.t_span, directions
+
+        def is_in_order() -> bool:  # by a quicker look, which also notes rates
+            return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
+
         with np.errstate(all="ignore"):
-            if not self.invariants.balances.items and unless_error(self._is_in_order, rhs, t, y) is not False:
+            if not known.balances.items and unless_error(is_in_order) is not False:
                 return None
             return unless_error(self._complaint, rhs, t, y)
 
@@ -100,12 +106,6 @@ class Examiner:
                 waited = int(suspect[data.SUSPECT_WAITED])
                 return unless_error(self._along_chord, rhs, (t_old, t_new), (old, new), waited)
         return None
-
-    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
-        """Return True if a first look at a state of a run without balances finds nothing, and note rates."""
-        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
-        of_run = known.target, known.scales, self.tau, known.t_span, directions
-        return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
 
     def _complaint(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return the text of the first of the `complaints` at a state, if f is finite there, and note rates."""

@@ -30,8 +30,7 @@ from ..core.solvers import EIPRK4, EIPSolver
 from ..core.states import states
 from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
-from ..run.driver import expected_steps
-from ..run.memory import check_bytes, most_bytes
+from ..run.driver import check_bytes, expected_steps, most_bytes
 from ..run.prepare import DEFAULT, Request, default_method
 from .checkpoints import opened
 from .executors import results

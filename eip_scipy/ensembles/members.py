@@ -93,7 +93,7 @@ class Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
         run, invariants = self.ready, self.ready.invariants
         loop = Loop(run, self.task.request._replace(progress=progress))
-        own_starts = run.identity()["project_initial"] or any(item.target is not None for item in invariants.items)
+        own_starts = run.projection.project_initial or any(item.target is not None for item in invariants.items)
         reasons: dict[str, Any] = {
             "the runs have derivatives": run.problem.variations is not None,
             "the runs have balances": invariants.balances.items,

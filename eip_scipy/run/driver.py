@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
+from ..core.inputs import is_number, shown
 from ..core.jitted import ChangedShapeError
 from ..core.native_functions import raise_again
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
-from .memory import most_bytes
 
-__all__ = ["Driver", "check_memory", "saved_rows"]
+__all__ = ["Driver", "check_bytes", "check_memory", "expected_steps", "most_bytes", "saved_rows"]
 
 # Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow later.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
+SMALL = 2**22  # number of bytes up to which the free memory is not determined, because that takes longer than a fill
 # Buffers of the record `Work`, and of the history of a multistep method, that determine the remaining steps.
 OF_WORK = (
     *("level", "level_carry", "slow", "carry", "err_sum", "sigma", "memory"),
@@ -260,3 +262,28 @@ def require_memory(needed: float, what: str, max_bytes: float | None, advice: st
             f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of "
             f"the free memory); {advice}."
         )
+
+
+def check_bytes(max_bytes: Any) -> None:
+    """Raise ValueError unless the option ``max_bytes`` is None or a number >= 0."""
+    if max_bytes is not None and not (is_number(max_bytes, "max_bytes") and max_bytes >= 0):
+        raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
+
+
+def most_bytes(needed: float, max_bytes: float | None) -> float:
+    """Return the bound in bytes on the memory of a run that needs `needed` bytes.
+
+    It is `max_bytes` if this is given, else `SMALL` for a run that needs no more, else half of the free memory.
+    """
+    if max_bytes is not None:
+        return max_bytes
+    return SMALL if needed <= SMALL else 0.5 * free_memory()
+
+
+def free_memory() -> float:
+    """Return an estimate of the number of bytes that a process can still allocate."""
+    with suppress(OSError, StopIteration), open("/proc/meminfo") as lines:
+        return 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1])
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return 0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 4e9

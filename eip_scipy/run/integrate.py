@@ -97,8 +97,7 @@ def integrate(
         Initial state, real or complex.
     acceleration : callable, optional
         Instead of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
-        (n/2,)``, in place ``acceleration(t, q, out[, params])``; a Python, Numba or C function as for `fun`.
-        Accelerations that depend on velocities belong in `fun`.
+        (n/2,)``, and otherwise as `fun`. Accelerations that depend on velocities belong in `fun`.
     method : type, optional
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
         `EIPRadau`, `EIPBDF`, or a class made by `eip_method`. `EIPRadau`, `EIPBDF` and classes made from a one-step
@@ -174,10 +173,9 @@ def integrate(
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
         the run instead.
-    diagnostics, first_step, max_step
-        As for the solver classes.
-    rtol, atol : float or array_like, optional
-        As for the solver classes, 1e-3 and 1e-6 by default. If `h` is given, they only scale the error metric.
+    diagnostics, first_step, max_step, rtol, atol
+        As for the solver classes; `rtol` and `atol` are 1e-3 and 1e-6 by default. If `h` is given, they only scale the
+        error metric.
 
     Returns
     -------
@@ -193,8 +191,8 @@ def integrate(
     MemoryError
         If the saved states would need more than `max_bytes`.
     CheckpointError
-        If the file cannot be written at the start, exists without ``resume=True``, is damaged, belongs to a run with
-        other arguments or functions, or is used by another run.
+        If the file cannot be written at the start, exists without ``resume=True``, is damaged or used by another run,
+        or belongs to one with other arguments or functions.
 
     Notes
     -----

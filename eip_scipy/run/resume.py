@@ -69,7 +69,7 @@ def settings(
         "max_step": span.max_step,
         "y0": y0,
         "params": params,
-        **run.identity(),
+        **run.projection.identity(run.options, run.invariants),
         "save_every": schedule.save_every or None,
         "t_eval": schedule.t_eval if schedule.t_eval.size else None,
         "events": events.ends,
