@@ -24,8 +24,6 @@ from .invariant_set import InvariantSet
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
 
-# Number of steps before the first check of the invariants, and the factor from one check to the next.
-FIRST_CHECK = SPACING = 10
 # Number of points of a step at which rates are examined, because a force may act for less than a step.
 POINTS = 8
 # Number of points in each earlier step that was not projected.
@@ -49,11 +47,8 @@ Derivative = Callable[[float, Array], Array]
 
 
 def steps_to_check(steps: int) -> int:
-    """Return the number of steps from step `steps` to the next check of the invariants."""
-    due = FIRST_CHECK
-    while due <= steps:
-        due *= SPACING
-    return due - steps
+    """Return the number of steps from step `steps` to the next check, which is due after 10, 100, 1000, ... steps."""
+    return int(10 ** len(str(steps))) - steps
 
 
 def is_check_due(steps: int) -> bool:

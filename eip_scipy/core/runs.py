@@ -215,17 +215,13 @@ class Run:
         """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
         t0, y0, f0, _ = self.begin
         options = self.options._replace(
-            metric=data.EUCLIDEAN,
-            direction=data.NEW,
-            iterations=START_ITERATIONS,
-            compensated=False,
-            watched=False,
+            metric=data.EUCLIDEAN, direction=data.NEW, iterations=START_ITERATIONS, compensated=False, watched=False,
             limit=np.inf,
-        )
+        )  # fmt: skip
         work = Work(y0.size, y0.dtype, 0, self.invariants.size, options.groups.start.size - 1)
         work.K[-1] = f0
-        y, status = self.projected(t0, y0, options, work)
-        if status != 0 or self.invariants.misses(t0, y, f0).any():
+        y = self.projected(t0, y0, options, work)
+        if self.invariants.misses(t0, y, f0).any():
             raise ValueError(projection_failure(self.invariants, work, t0))
         return y
 
@@ -269,13 +265,15 @@ class Run:
             engine.start(self.y0, f, self.start.tau)
         return engine
 
-    def projected(self, t: float, y: Array, options: Any, work: Work) -> tuple[Array, int]:
-        """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there."""
+    def projected(self, t: float, y: Array, options: Any, work: Work) -> Array:
+        """Return the projection of a state, or raise ValueError; work.K[-1] must hold the derivative there."""
         derivative = Call(self.problem.derivative, (), y.shape, lambda value, t: np.array(value, y.dtype))
         functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
         engine = Engine(data.NO_METHOD, options._replace(joint=None, balances=data.NO_BALANCES), work, functions)
         work.y_hat[:], out = y, np.empty_like(y)
-        return out, engine.project(t, y, t, True, out)
+        if engine.project(t, y, t, True, out) != 0:
+            raise ValueError(projection_failure(self.invariants, work, t))
+        return out
 
     def attach(self, diagnostics: Any) -> None:
         """Let `diagnostics` read the run's buffers."""

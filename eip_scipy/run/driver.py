@@ -20,7 +20,7 @@ from ..core.step_control import UNBOUNDED
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
 
-__all__ = ["Driver", "check_bytes", "check_memory", "expected_steps", "most_bytes", "saved_rows"]
+__all__ = ["Driver", "check_bytes", "check_memory", "expected_steps", "require_memory", "saved_rows"]
 
 # Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow later.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
@@ -37,7 +37,7 @@ class Driver:
     """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps.
 
     A row is a saved time with its state. `max_bytes` bounds the memory of the rows and that of the interpolants, see
-    `most_bytes`. `interpolants` is None if nothing needs states between steps.
+    `require_memory`. `interpolants` is None if nothing needs states between steps.
     """
 
     def __init__(
@@ -154,11 +154,6 @@ class Driver:
         self.t[self.rows], self.y[self.rows] = t, y
         self.schedule.place[ROW] += 1
 
-    def save_start(self) -> None:
-        """Save the start as the first row, if it is requested and not saved already."""
-        if self.rows == 0 and (self.schedule.t_eval.size == 0 or self.schedule.t_eval[0] == self.schedule.span.t0):
-            self.save(self.schedule.span.t0, self.state)
-
     def save_now(self) -> None:
         """Save the last accepted state, or its projected copy, unless it is the last saved row already."""
         t, y = self.now
@@ -185,7 +180,7 @@ class Driver:
     def _more_segments(self, count: int) -> np.ndarray:
         floats = self.interpolants.floats
         needed = (self._kept + count) * 8.0 * floats
-        require_memory(needed, "dense_output=True", self._max_bytes, "use t_eval, or increase max_bytes")
+        require_memory(needed, "dense_output=True needs", self._max_bytes, "use t_eval, or increase max_bytes")
         return np.empty((count, floats))
 
     @property
@@ -249,18 +244,22 @@ def expected_steps(schedule: Schedule) -> int:
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Raise MemoryError if `rows` saved states of the run would need more memory than `max_bytes` allows."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
-    require_memory(
-        needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "increase save_every or max_bytes"
-    )
+    what = f"saving {rows:.3g} states of {run.y0.size} components needs"
+    require_memory(needed, what, max_bytes, "increase save_every or max_bytes")
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
-    """Raise MemoryError, with `advice`, if the `needed` bytes for `what` exceed the bound of `most_bytes`."""
-    bound = most_bytes(needed, max_bytes)
+    """Raise MemoryError if `needed` bytes exceed `max_bytes`, by default half of the free memory, or `SMALL` if more.
+
+    The message begins with `what`, which ends with a verb, and ends with `advice`.
+    """
+    bound = max_bytes
+    if bound is None:
+        bound = SMALL if needed <= SMALL else 0.5 * free_memory()
     if needed > bound:
         raise MemoryError(
-            f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of "
-            f"the free memory); {advice}."
+            f"{what} {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of the "
+            f"free memory); {advice}."
         )
 
 
@@ -268,16 +267,6 @@ def check_bytes(max_bytes: Any) -> None:
     """Raise ValueError unless the option ``max_bytes`` is None or a number >= 0."""
     if max_bytes is not None and not (is_number(max_bytes, "max_bytes") and max_bytes >= 0):
         raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
-
-
-def most_bytes(needed: float, max_bytes: float | None) -> float:
-    """Return the bound in bytes on the memory of a run that needs `needed` bytes.
-
-    It is `max_bytes` if this is given, else `SMALL` for a run that needs no more, else half of the free memory.
-    """
-    if max_bytes is not None:
-        return max_bytes
-    return SMALL if needed <= SMALL else 0.5 * free_memory()
 
 
 def free_memory() -> float:

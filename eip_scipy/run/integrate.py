@@ -40,6 +40,7 @@ FIRST_CHUNK = 64
 SLOW_SECONDS = 2.0
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
+COMPILING = {"desc": "compiling the functions", "total": 0, "bar_format": "{desc}", "leave": False}
 
 
 @takes_projection_options
@@ -243,8 +244,8 @@ class Loop:
                 f"checkpoint: a file cannot store the internal state of SciPy's {run.tableau.name}, which resuming "
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
-        compiles = given.progress and given.compiled is not False and is_jitted(problem.fun)
-        with _bar(compiles, total=0, desc="compiling the functions", bar_format="{desc}", leave=False):
+        compiles = given.compiled is not False and is_jitted(problem.fun)
+        with _bar(given.progress and compiles, lambda: COMPILING):
             functions, self.why_not = problem.functions(run, given.compiled)
             self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
@@ -258,7 +259,7 @@ class Loop:
         driver, keeper, result = self.driver, self.keeper, None
         self._begin = time.perf_counter() - (0.0 if keeper is None else keeper.seconds)
         try:
-            with _bar(self.given.progress, **self._shown_by_bar()) as bar:
+            with _bar(self.given.progress, self._shown_by_bar) as bar:
                 status, message = self.steps(bar)
             if keeper is not None:
                 keeper.end(status, message)
@@ -290,7 +291,9 @@ class Loop:
     def _steps(self, bar: Any) -> tuple[int, str]:
         driver, schedule = self.driver, self.driver.schedule
         if driver.step == 0:
-            driver.save_start()
+            t0, times = schedule.span.t0, schedule.t_eval
+            if driver.rows == 0 and (times.size == 0 or times[0] == t0):
+                driver.save(t0, driver.state)
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
@@ -394,11 +397,13 @@ class Loop:
         return {"desc": self.driver.run.name, **shown}
 
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        """Return the result at the end of a run, without values of invariants that fail again if it is `broken`."""
+        """Return the result at the end of a run; if it is `broken`, invariants whose functions fail again are NaN."""
         driver, run, events = self.driver, self.driver.run, self.events
         if status < 0:
             driver.save_now()
-        values, target = self._values(broken), run.invariants.fixed_target
+        values, target = np.full((run.invariants.size, driver.rows), np.nan), run.invariants.fixed_target
+        with suppress(BaseException) if broken else nullcontext():
+            values = driver.values()
         driver.note(values, target)
         t, y = events.last if self._event_ended else driver.now
         sol, asked, kept = driver.solution(t), self.given, run.invariants.with_targets
@@ -452,15 +457,6 @@ class Loop:
             )
         return tuple(str(note) for note in (*notes, run.conserved.missing) if note is not None)
 
-    def _values(self, broken: bool) -> np.ndarray:
-        """Return the invariants (l, m) of the saved states; NaN if an error has `broken` the run and occurs again."""
-        try:
-            return self.driver.values()
-        except BaseException:
-            if not broken:
-                raise
-            return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
-
 
 def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
     """Return a result with the given `fields` and those that follow from the `run`.
@@ -488,13 +484,13 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
     return result
 
 
-def _bar(shown: bool, **options: Any) -> Any:
+def _bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
     """Return a context manager that yields a progress bar with these options of tqdm, or None if it is not `shown`."""
     if not shown:
         return nullcontext()
     from tqdm import tqdm
 
-    return tqdm(**options)
+    return tqdm(**options())
 
 
 def _attach_start(error: BaseException, request: Request, seconds: float) -> None:
