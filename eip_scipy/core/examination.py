@@ -24,8 +24,6 @@ from .invariant_set import InvariantSet
 
 __all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
 
-# Number of steps before the first check of the invariants, and the factor from one check to the next.
-FIRST_CHECK = SPACING = 10
 # Number of points of a step at which rates are examined, because a force may act for less than a step.
 POINTS = 8
 # Number of points in each earlier step that was not projected.
@@ -49,11 +47,8 @@ Derivative = Callable[[float, Array], Array]
 
 
 def steps_to_check(steps: int) -> int:
-    """Return the number of steps from step `steps` to the next check of the invariants."""
-    due = FIRST_CHECK
-    while due <= steps:
-        due *= SPACING
-    return due - steps
+    """Return the number of steps from step `steps` to the next check, which is due after 10, 100, 1000, ... steps."""
+    return int(10 ** len(str(steps))) - steps
 
 
 def is_check_due(steps: int) -> bool:
@@ -81,8 +76,14 @@ class Examiner:
 
     def finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
+        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
+        of_run = known.target, known.scales, self.tau, known.t_span, directions
+
+        def is_in_order() -> bool:  # by a quicker look, which also notes rates
+            return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
+
         with np.errstate(all="ignore"):
-            if not self.invariants.balances.items and unless_error(self._is_in_order, rhs, t, y) is not False:
+            if not known.balances.items and unless_error(is_in_order) is not False:
                 return None
             return unless_error(self._finding, rhs, t, y)
 
@@ -100,12 +101,6 @@ class Examiner:
                 waited = int(suspect[data.SUSPECT_WAITED])
                 return unless_error(self._along_chord, rhs, (t_old, t_new), (old, new), waited)
         return None
-
-    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
-        """Return True if a first look at a state of a run without balances finds nothing, and note rates."""
-        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
-        of_run = known.target, known.scales, self.tau, known.t_span, directions
-        return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
 
     def _finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return the text of the first of the `findings` at a state, if f is finite there, and note rates."""

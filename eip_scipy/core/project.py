@@ -13,7 +13,6 @@ from ..engine.data import BAND, EPS, LARGE_SHARE, LAST_RANK
 from ..engine.trust import ProjectionWarning
 from ..methods.base import PROJECTION_ONLY
 from .bound_problem import BoundProblem
-from .failures import projection_failure
 from .inputs import as_vector, count, initial_state, is_number, reals, shown
 from .invariant_set import InvariantSet
 from .projection import MOST_ITERATIONS, ProjectionOptions, weights
@@ -114,9 +113,7 @@ def project(
         most_left=np.full(known.size, np.inf),  # always do all Newton steps
     )
     work.K[-1] = run.start.f
-    out, status = run.projected(t, y, options, work)
-    if status != 0:
-        raise ValueError(projection_failure(known, work, t))
+    out = run.projected(t, y, options, work)
     left = np.abs(work.residual) * BAND * EPS / np.where(work.band > 0, work.band, 1.0)
     for k in np.flatnonzero(left > LARGE_SHARE):
         warnings.warn(

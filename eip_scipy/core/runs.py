@@ -9,19 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
-from ..engine.data import (
-    BY_ERROR,
-    EPS,
-    EUCLIDEAN,
-    EXAMINED,
-    NEW,
-    NO_BALANCES,
-    NO_METHOD,
-    NOTHING,
-    REASON,
-    Schedule,
-    Work,
-)  # fmt: skip
+from ..engine import data
+from ..engine.data import EPS, NOTHING, REASON, Schedule, Work
 from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
@@ -105,10 +94,6 @@ class Run:
         """Return the state at which the first step starts."""
         return self.start.y
 
-    def identity(self) -> dict[str, Any]:
-        """Return the options that determine the bits of the run, by name."""
-        return self.projection.identity(self.options, self.invariants)
-
     @property
     def uses_jacobian(self) -> bool:
         """True if the method corrects accelerations by the Jacobian."""
@@ -135,7 +120,10 @@ class Run:
 
     def _start_at(self, y0: Array, f0: Array | None, tau: float | None, check: bool, is_known: bool) -> None:
         f0 = self.examine(y0, f0, is_known=is_known)
-        tau = self._first_step(y0, f0) if tau is None else tau
+        if tau is None:  # it depends on the state alone, without tangent vectors
+            tangents = self.tangents
+            derivative = tangents.of_state(self.problem.derivative, y0)
+            tau = self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), self.method)
         self.begin = self.start = Start(self.stepping.span.t0, y0, f0, tau)
         self._make_buffers(check)
         if self.method is PROJECTION_ONLY:
@@ -156,12 +144,6 @@ class Run:
         if not (is_known or is_second_order):
             self.method = self.method.checked(self, Start(t0, y0, f0, 0.0))
         return f0
-
-    def _first_step(self, y0: Array, f0: Array) -> float:
-        """Return the length of the first step, chosen from the state alone, without tangent vectors."""
-        tangents = self.tangents
-        derivative = tangents.of_state(self.problem.derivative, y0)
-        return self.stepping.first(derivative, tangents.state(y0), tangents.state(f0), self.method)
 
     def _make_buffers(self, tell: bool) -> None:
         """Evaluate the invariants at the start, and make the buffers for them; `tell`: see `InvariantSet`."""
@@ -233,12 +215,13 @@ class Run:
         """Return the start projected onto the targets, by full Newton steps in the euclidean metric."""
         t0, y0, f0, _ = self.begin
         options = self.options._replace(
-            metric=EUCLIDEAN, direction=NEW, iterations=START_ITERATIONS, compensated=False, watched=False, limit=np.inf
-        )
+            metric=data.EUCLIDEAN, direction=data.NEW, iterations=START_ITERATIONS, compensated=False, watched=False,
+            limit=np.inf,
+        )  # fmt: skip
         work = Work(y0.size, y0.dtype, 0, self.invariants.size, options.groups.start.size - 1)
         work.K[-1] = f0
-        y, status = self.projected(t0, y0, options, work)
-        if status != 0 or self.invariants.misses(t0, y, f0).any():
+        y = self.projected(t0, y0, options, work)
+        if self.invariants.misses(t0, y, f0).any():
             raise ValueError(projection_failure(self.invariants, work, t0))
         return y
 
@@ -282,13 +265,15 @@ class Run:
             engine.start(self.y0, f, self.start.tau)
         return engine
 
-    def projected(self, t: float, y: Array, options: Any, work: Work) -> tuple[Array, int]:
-        """Return the projection of a state, and the engine's status code; work.K[-1] must hold the derivative there."""
+    def projected(self, t: float, y: Array, options: Any, work: Work) -> Array:
+        """Return the projection of a state, or raise ValueError; work.K[-1] must hold the derivative there."""
         derivative = Call(self.problem.derivative, (), y.shape, lambda value, t: np.array(value, y.dtype))
         functions = PythonFunctions(derivative, *self.invariants.calls, (), second_order=False)
-        engine = Engine(NO_METHOD, options._replace(joint=None, balances=NO_BALANCES), work, functions)
+        engine = Engine(data.NO_METHOD, options._replace(joint=None, balances=data.NO_BALANCES), work, functions)
         work.y_hat[:], out = y, np.empty_like(y)
-        return out, engine.project(t, y, t, True, out)
+        if engine.project(t, y, t, True, out) != 0:
+            raise ValueError(projection_failure(self.invariants, work, t))
+        return out
 
     def attach(self, diagnostics: Any) -> None:
         """Let `diagnostics` read the run's buffers."""
@@ -301,7 +286,7 @@ class Run:
             _max_correction=w.max_correction,
             _counters=w.counters,
             _trust=self.trust,
-            _estimated=self.options.metric == BY_ERROR,
+            _estimated=self.options.metric == data.BY_ERROR,
             moved=self.moved,
             remarks=self.conserved.remarks,
             _slow=(self.invariants.balances.places, w.slow),
@@ -321,66 +306,62 @@ class Run:
         return bool(BUILD.call(self._look, steps, ended, t, y))
 
     def _look(self, steps: int, ended: bool, t: float, y: Array) -> bool:
-        rhs = self.problem.derivative
+        rhs, suspect = self.problem.derivative, self.work.suspect
         if self.trust.failed or not self.options.watched:  # a failure has its own message
             return False
         if ended:
-            self._warn_of_fast_balances()
-            self._warn_of_refuted_constraints(t, y, rhs)
-        suspect = self.work.suspect
-        if self.trust.doubts:
-            # One examination is still needed for the rates of the invariants, which are used to judge corrections.
-            if suspect[REASON] != NOTHING and not self.work.trust[:, EXAMINED].any():
-                self.examiner.examine(suspect, rhs)
-            return self._is_doubtful(ended)
-        found = self.examiner.examine(suspect, rhs) if suspect[REASON] != NOTHING else None
-        due = (ended or is_check_due(steps)) and steps != self.looked
-        doubtful = not due and self._is_doubtful(ended)
-        if found is None and (due or doubtful):
-            self.looked = steps
-            found = self.examiner.finding(rhs, t, y)
-            doubtful = self._is_doubtful(ended)  # which depends on the rates that the examination has noted
+            for text in filter(None, (self._fast_balances(), self._refuted_constraints(t, y, rhs))):
+                warnings.warn(text, UserWarning, stacklevel=users_level())
+        found, is_flagged = None, suspect[REASON] != NOTHING
+        if not self.trust.doubts:
+            found = self.examiner.examine(suspect, rhs) if is_flagged else None
+            is_due = (ended or is_check_due(steps)) and steps != self.looked
+            if found is None and (is_due or self._is_doubtful(ended)):
+                self.looked = steps
+                found = self.examiner.finding(rhs, t, y)
+        elif is_flagged and not self.work.trust[:, data.EXAMINED].any():
+            self.examiner.examine(suspect, rhs)  # once more for the rates, which are used to judge corrections
         self.trust.doubts += [found] if found else []
-        return found is not None or doubtful
-
-    def _warn_of_fast_balances(self) -> None:
-        """Warn once about balances that change too fast to be useful."""
-        carried = self.invariants.balances
-        if not carried.items or self._warned_of_balances:
-            return
-        found = slowness(self.work.slow)
-        fast = np.flatnonzero(found > carried.most_slowness)
-        if not fast.size:
-            return
-        self._warned_of_balances = True
-        names, bound = [self.invariants.names[place] for place in carried.places[fast]], carried.most_slowness[fast[0]]
-        warnings.warn(
-            f"balance {listed(names)} changes too fast to be of much use: on average its rate is "
-            f"{found[fast].max():.2g} of the sum of the absolute values of the terms of grad @ f (the largest of "
-            f"Diagnostics.slowness). Above {bound:g} a balance hardly improves the result. Compare with a run without "
-            "it, or with other tolerances.",
-            UserWarning,
-            stacklevel=users_level(),
-        )
-
-    def _warn_of_refuted_constraints(self, t: float, y: Array, rhs: Derivative) -> None:
-        """Warn if linear invariants that were found at the start do not hold at the state y, as in contact."""
-        linear = self.conserved.linear
-        if not len(linear.C) or linear.C.shape[1] != y.size:
-            return
-        lost = len(linear.C) - len(linear.only(confirmed(y[None], rhs(t, y)[None], linear)).C)
-        if lost:
-            warnings.warn(
-                f"{lost} of the {len(linear.C)} linear invariants that were found at the start do not "
-                f"hold at t={t:.6g}. The corrections leave them unchanged, which may make the result less accurate. "
-                "Pass linear_invariants=None.",
-                UserWarning,
-                stacklevel=users_level(),
-            )
+        return found is not None or self._is_doubtful(ended)
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return True if corrections or errors show that the run is faulty, before its end without hope of recovery."""
         return self.trust.exceeds_bounds if ended else self.trust.beyond_doubt
+
+    def _fast_balances(self) -> str:
+        """Return a text about balances that change too fast to be useful; "" without any, or after the first call."""
+        balances = self.invariants.balances
+        if not balances.items or self._warned_of_balances:
+            return ""
+        found = slowness(self.work.slow)
+        fast = np.flatnonzero(found > balances.most_slowness)
+        if not fast.size:
+            return ""
+        self._warned_of_balances = True
+        names, bound = (
+            [self.invariants.names[place] for place in balances.places[fast]],
+            balances.most_slowness[fast[0]],
+        )
+        return (
+            f"balance {listed(names)} changes too fast to be of much use: on average its rate is "
+            f"{found[fast].max():.2g} of the sum of the absolute values of the terms of grad @ f (the largest of "
+            f"Diagnostics.slowness). Above {bound:g} a balance hardly improves the result. Compare with a run without "
+            "it, or with other tolerances."
+        )
+
+    def _refuted_constraints(self, t: float, y: Array, rhs: Derivative) -> str:
+        """Return a text if linear invariants that were found at the start do not hold at the state y, as in contact."""
+        linear = self.conserved.linear
+        if not len(linear.C) or linear.C.shape[1] != y.size:
+            return ""
+        lost = len(linear.C) - len(linear.only(confirmed(y[None], rhs(t, y)[None], linear)).C)
+        if not lost:
+            return ""
+        return (
+            f"{lost} of the {len(linear.C)} linear invariants that were found at the start do not hold at t={t:.6g}. "
+            "The corrections leave them unchanged, which may make the result less accurate. Pass "
+            "linear_invariants=None."
+        )
 
     @cached_property
     def examiner(self) -> Examiner:

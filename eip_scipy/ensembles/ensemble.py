@@ -27,8 +27,7 @@ from ..core.projection import ProjectionDetails
 from ..core.solvers import EIPRK4, EIPSolver
 from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
-from ..run.driver import expected_steps
-from ..run.memory import check_bytes, most_bytes
+from ..run.driver import check_bytes, expected_steps, require_memory
 from ..run.prepare import DEFAULT, RunArguments, default_method
 from .checkpoints import opened
 from .executors import results
@@ -455,11 +454,7 @@ def _check_memory(plan: Plan, members: int, max_bytes: float | None) -> None:
     """Raise MemoryError if the results would need too much memory."""
     rows = plan.held
     each = plan.size * plan.dtype.itemsize * (1 + rows) + 8 * (len(plan.names) * (3 + rows) + N_COUNTERS + 4)
-    bound = most_bytes(members * each, max_bytes)
-    if members * each > bound:
-        many = f"{rows} states per member would be stored. Save fewer (save_every, t_eval), use reduce="
-        advice = many if rows else "The last state of each member would be stored. Run the members in parts"
-        raise MemoryError(
-            f"{members} members of {plan.size} components need {members * each / 1e9:.3g} GB, the bound is "
-            f"{bound / 1e9:.3g} GB. {advice}, or raise max_bytes."
-        )
+    many = f"{rows} states per member would be stored: save fewer (save_every, t_eval), use reduce="
+    advice = many if rows else "the last state of each member would be stored. Run the members in parts"
+    what = f"{members} members of {plan.size} components need"
+    require_memory(members * each, what, max_bytes, f"{advice}, or increase max_bytes")

@@ -91,7 +91,7 @@ class Plan:
         """Compile the functions, before threads start and would each compile them, and return the plan itself."""
         run, invariants = self.ready, self.ready.invariants
         loop = Loop(run, self.task.request._replace(progress=progress))
-        own_starts = run.identity()["project_initial"] or any(item.target is not None for item in invariants.items)
+        own_starts = run.projection.project_initial or any(item.target is not None for item in invariants.items)
         reasons: dict[str, Any] = {
             "the runs have derivatives": run.problem.variations is not None,
             "the runs have balances": invariants.balances.items,
@@ -180,7 +180,7 @@ class Plan:
         found = {
             "y": y, "t": t, "status": status, "message": loop.explained(message), "target": target,
             "trusted": driver.run.trust.trusted and status >= 0, "max_residual": driver.run.work.max_residual,
-            "max_correction": loop.diagnostics.max_correction, "end_invariants": at_end,
+            "max_correction": loop.driver.run.diagnostics.max_correction, "end_invariants": at_end,
             "trajectories": np.pad(driver.y[:rows].T, padding, constant_values=np.nan),
             "invariants": np.pad(values[:rows].T, padding, constant_values=np.nan),
             **{name: driver.run.work.counters[place] for name, place in COUNTERS.items()},
@@ -229,7 +229,7 @@ class BatchRunner:
         out["side_by_side"][arrived] = not self.not_batched_because
         for name, place in COUNTERS.items():
             out[name][arrived] = each.counters[arrived, place]
-        if np.isnan(self._loop.diagnostics.max_correction):  # the method has no error estimate
+        if np.isnan(self._driver.run.diagnostics.max_correction):  # the method has no error estimate
             out["max_correction"][arrived] = np.nan
         BUILD.call(self._judge, arrived, each, out)
 
@@ -265,7 +265,7 @@ class BatchRunner:
     def _derivative(self, params: np.ndarray) -> Callable[[float, np.ndarray], np.ndarray]:
         """Set the parameters of the driver to those of a member, and return the right-hand side."""
         self._driver.params[:] = params
-        return self._loop.problem.derivative
+        return self._driver.run.problem.derivative
 
     def _advance(self, each: data.Members, out: dict[str, Any]) -> bool:
         """Make some steps; return False if the current member must run alone, and go to the next one then."""

@@ -3,34 +3,40 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, NoReturn
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..core.dense import Interpolants, ManifoldDenseOutput, solution
 from ..core.functions import ChangedShapeError, reraise_user_exception
+from ..core.inputs import is_number, shown
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED
-from ..engine.data import NOTHING, PENDING, REASON, ROW, STEP, TIME, TIME_NEW, Members, Schedule
+from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
 from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
-from .memory import most_bytes
 
-__all__ = ["Driver", "check_memory", "saved_rows"]
+__all__ = ["Driver", "check_bytes", "check_memory", "expected_steps", "require_memory", "saved_rows"]
 
 # Rows and bytes allocated at the start of a run whose number of steps is unknown; the buffers grow later.
 FIRST_ROWS, FIRST_BYTES = 1024, 2**24
-# Buffers that decide the remaining steps, or count.
-OF_WORK = ["carry", "err_sum", "sigma", "memory", "residual", "max_residual", "max_correction", "trust", "counters"]
+SMALL = 2**22  # number of bytes up to which the free memory is not determined, because that takes longer than a fill
+# Buffers of the record `Work`, and of the history of a multistep method, that determine the remaining steps.
+OF_WORK = (
+    *("level", "level_carry", "slow", "carry", "err_sum", "sigma", "memory"),
+    *("residual", "max_residual", "max_correction", "trust", "counters"),
+)
+OF_HISTORY = ("rates", "rate_sums", "nodes", "sums", "place", "levels")
 
 
 class Driver:
     """One run: its functions, buffers and saved rows, and with `keeps_steps` the interpolants of its steps.
 
     A row is a saved time with its state. `max_bytes` bounds the memory of the rows and that of the interpolants, see
-    `most_bytes`.
+    `require_memory`. `interpolants` is None if nothing needs states between steps.
     """
 
     def __init__(
@@ -54,26 +60,25 @@ class Driver:
         self.state = run.y0.copy()
         self.new = np.empty_like(self.state)
         self.engine = run.engine(functions)
-        self._interpolants = None
-        self._pieces = np.empty((0, 0))
+        self.interpolants: Any = None
+        self._segments = np.empty((0, 0))
         if schedule.t_eval.size or schedule.g.size or keeps_steps or run.shows:
-            self._interpolants = Interpolants(run, self.engine, schedule.g.size, errors=self.own_errors)
-            steps = expected_steps(schedule) or _first(8 * self._interpolants.floats)
-            self._pieces = self._more_pieces(steps if keeps_steps else 0)
+            self.interpolants = Interpolants(run, self.engine, schedule.g.size, errors=self.own_errors)
+            steps = expected_steps(schedule) or _first(8 * self.interpolants.floats)
+            self._segments = self._more_segments(steps if keeps_steps else 0)
 
     def advance(self, k_end: int) -> int:
         """Advance to step `k_end`, or until something stops the loop earlier; return the loop's status code."""
-        interpolants = self._interpolants
+        interpolants = self.interpolants
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
-        try:
-            return int(self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._pieces))
-        except FailedCallError as error:
-            failed = error.args
-        finally:
-            if interpolants is not None:
-                self._events.take(*interpolants.roots())
-        self._raise_own(*failed)
+        with self.own_errors():
+            try:
+                code = self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._segments)
+            finally:
+                if interpolants is not None:
+                    self._events.take(*interpolants.roots())
+        return int(code)
 
     def sweep(self, members: Members, steps: int) -> int:
         """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
@@ -98,33 +103,19 @@ class Driver:
         """Replace a `FailedCallError` raised in the block by the exception of the Numba or C function that failed."""
         try:
             yield
+            return
         except FailedCallError as error:
             failed = error.args
-        else:
-            return
-        self._raise_own(*failed)
-
-    def _raise_own(self, *failed: Any) -> NoReturn:
-        """Raise the exception of the Numba or C function that failed; the arguments are those of `FailedCallError`."""
         try:
             reraise_user_exception(self.functions, *failed)
-        except ChangedShapeError as changed:
-            self.place(changed)
+        except ChangedShapeError as changed:  # compiled code cannot format the time
+            changed.args = (f"{changed}, in the step from t={self.schedule.clock[TIME]:.10g}",)
             raise
-
-    def place(self, error: ChangedShapeError) -> None:
-        """Add the time of the step to the message of an error from compiled code, which cannot format numbers."""
-        error.args = (f"{error}, in the step from t={self.schedule.clock[TIME]:.10g}",)
 
     @property
     def step(self) -> int:
         """Number of steps made so far."""
         return int(self.schedule.place[STEP])
-
-    @property
-    def suspects(self) -> bool:
-        """Return True if the engine has marked a step as suspect, so that `Run.look` must examine the run."""
-        return bool(self.run.work.suspect[REASON] != NOTHING)
 
     @property
     def rows(self) -> int:
@@ -138,36 +129,23 @@ class Driver:
         return float(self.schedule.clock[TIME_NEW if pending else TIME]), self.new if pending else self.state
 
     def parts(self) -> dict[str, np.ndarray]:
-        """Return the counters and the buffers, by name, that determine the remaining steps."""
-        w, schedule, history = self.run.work, self.schedule, self.run.stepper.multistep
-        found = {"place": schedule.place, "clock": schedule.clock, "y": self.state, "slope": w.K[0], "g": schedule.g}
-        if schedule.g.size:
-            found["rate"] = schedule.rate
-        found["target"] = self.run.options.target
-        balanced = w.level.size > 0
-        if balanced:
-            found |= {"level": w.level, "level_carry": w.level_carry, "slow": w.slow, "balance_rate": w.rates[0]}
-        if history is not None:
-            found |= {"rates": history.rates, "rate_sums": history.rate_sums} if balanced else {}
-            found |= {"nodes": history.nodes, "sums": history.sums, "node": history.place, "levels": history.levels}
-        return found | {name: getattr(w, name) for name in OF_WORK}
+        """Return the counters and the buffers, by name, that determine the remaining steps.
 
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """Return copies of the buffers of `parts` after the last accepted step, in which the loop may have paused."""
-        copies = {name: part.copy() for name, part in self.parts().items()}
-        work, schedule = self.run.work, self.schedule
-        if schedule.place[PENDING] == 1:
-            copies["place"][PENDING] = 0
-            copies["clock"][TIME] = schedule.clock[TIME_NEW]
-            new = {"y": self.new, "slope": work.K[-1], "g": schedule.g_new, "rate": schedule.rate_new}
-            new |= {"balance_rate": work.rates[-1]}
-            copies |= {name: new[name].copy() for name in copies.keys() & new.keys()}
-        return copies
+        After a step in which the loop has paused, they are those that follow this step.
+        """
+        w, schedule, history = self.run.work, self.schedule, self.run.stepper.multistep
+        place, clock, g, rate, last = schedule.place, schedule.clock, schedule.g, schedule.rate, 0
+        if place[PENDING] == 1:
+            place, clock, g, rate, last = place.copy(), clock.copy(), schedule.g_new, schedule.rate_new, -1
+            place[PENDING], clock[TIME] = 0, clock[TIME_NEW]
+        found = {"place": place, "clock": clock, "y": self.now[1], "slope": w.K[last], "balance_rate": w.rates[last]}
+        found |= {"g": g, "rate": rate, "target": self.run.options.target}
+        found |= {name: getattr(w, name) for name in OF_WORK}
+        return found | ({} if history is None else {f"history_{name}": getattr(history, name) for name in OF_HISTORY})
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:
         """Copy the saved times `t` (m,) and states `y` (m, n) of a run that is resumed to the buffers of rows."""
-        while self.t.size <= t.size:
-            self._more_rows()
+        self._reserve(t.size + 1)
         self.t[: t.size], self.y[: t.size] = t, y
 
     def save(self, t: float, y: np.ndarray) -> None:
@@ -175,21 +153,11 @@ class Driver:
         self.t[self.rows], self.y[self.rows] = t, y
         self.schedule.place[ROW] += 1
 
-    def save_start(self) -> None:
-        """Save the start as the first row, if it is requested and not saved already."""
-        if self.rows == 0 and (self.schedule.t_eval.size == 0 or self.schedule.t_eval[0] == self.schedule.span.t0):
-            self.save(self.schedule.span.t0, self.state)
-
     def save_now(self) -> None:
-        """Save the last accepted state after an early end of the run, unless it is the last saved row already."""
+        """Save the last accepted state, or its projected copy, unless it is the last saved row already."""
         t, y = self.now
         if self.rows == 0 or self.t[self.rows - 1] != t:
-            self.save(t, self.shown(t, y))
-
-    def shown(self, t: float, y: np.ndarray) -> np.ndarray:
-        """Return the last state `y` at `t` in the form of the saved rows, which may be a projected copy."""
-        interpolants = self._interpolants
-        return interpolants.shown(t, y) if interpolants is not None and interpolants.record.shows else y
+            self.save(t, self.interpolants.shown(t, y) if self.run.shows else y)
 
     def cut(self, t: float, y: np.ndarray) -> None:
         """Remove the saved rows from `t` on, and append the state `y` at `t`, in which an event ended the run."""
@@ -199,49 +167,41 @@ class Driver:
 
     def grow(self) -> None:
         """Double the buffers of rows or interpolants that are full; raise MemoryError beyond `max_bytes`."""
-        if self._kept and self._kept == len(self._pieces):
-            self._pieces = np.concatenate([self._pieces, self._more_pieces(self._kept)])
-        if self.rows + 2 > self.t.size:
-            self._more_rows()
+        if self._kept and self._kept == len(self._segments):
+            self._segments = np.concatenate([self._segments, self._more_segments(self._kept)])
+        self._reserve(self.rows + 2)
 
-    def _more_rows(self) -> None:
-        rows = 2 * self.t.size
-        check_memory(rows, self.run, self._max_bytes)
-        self.t = np.resize(self.t, rows)
-        self.y = np.concatenate([self.y, np.empty_like(self.y)])
+    def _reserve(self, rows: int) -> None:
+        while self.t.size < rows:
+            check_memory(2 * self.t.size, self.run, self._max_bytes)
+            self.t, self.y = (np.concatenate([buffer, np.empty_like(buffer)]) for buffer in (self.t, self.y))
 
-    def _more_pieces(self, count: int) -> np.ndarray:
-        floats = 0 if self._interpolants is None else self._interpolants.floats
+    def _more_segments(self, count: int) -> np.ndarray:
+        floats = self.interpolants.floats
         needed = (self._kept + count) * 8.0 * floats
-        require_memory(needed, "dense_output=True", self._max_bytes, "use t_eval, or increase max_bytes")
+        require_memory(needed, "dense_output=True needs", self._max_bytes, "use t_eval, or increase max_bytes")
         return np.empty((count, floats))
 
     @property
     def _kept(self) -> int:
         """Number of interpolants stored so far."""
-        return 0 if self._interpolants is None else int(self._interpolants.record.counts[1])
-
-    @property
-    def interpolants(self) -> Interpolants:
-        """Return the interpolants of a run that has events or times between steps, or stores its steps."""
-        assert self._interpolants is not None
-        return self._interpolants
+        return 0 if self.interpolants is None else int(self.interpolants.record.counts[1])
 
     def dense(self) -> DenseOutput:
         """Return the dense output over the pending step."""
-        piece = self._pieces[self._kept - 1] if self._kept else self.interpolants.record.piece.copy()
-        return ManifoldDenseOutput(self.interpolants, piece)
+        segment = self._segments[self._kept - 1] if self._kept else self.interpolants.record.piece.copy()
+        return ManifoldDenseOutput(self.interpolants, segment)
 
     def warn(self) -> None:
         """Warn about states between steps that the loop could not project."""
-        if self._interpolants is not None:
-            self._interpolants.warn()
+        if self.interpolants is not None:
+            self.interpolants.warn()
 
     def solution(self, t_end: float) -> OdeSolution | None:
         """Return the dense output from the start of the run to `t_end`, or None if the run does not store its steps."""
-        if self._interpolants is None or not self._pieces.size:
+        if not self._segments.size:
             return None
-        return solution(self._interpolants, self._pieces[: self._kept], t_end, self.now[1])
+        return solution(self.interpolants, self._segments[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray, target: np.ndarray) -> None:
         """Update the largest errors (l,) with the `values` (l, m) at the saved states except the start."""
@@ -283,16 +243,35 @@ def expected_steps(schedule: Schedule) -> int:
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Raise MemoryError if `rows` saved states of the run would need more memory than `max_bytes` allows."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
-    require_memory(
-        needed, f"saving {rows:.3g} states of {run.y0.size} components", max_bytes, "increase save_every or max_bytes"
-    )
+    what = f"saving {rows:.3g} states of {run.y0.size} components needs"
+    require_memory(needed, what, max_bytes, "increase save_every or max_bytes")
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:
-    """Raise MemoryError, with `advice`, if the `needed` bytes for `what` exceed the bound of `most_bytes`."""
-    bound = most_bytes(needed, max_bytes)
+    """Raise MemoryError if `needed` bytes exceed `max_bytes`, by default half of the free memory, or `SMALL` if more.
+
+    The message begins with `what`, which ends with a verb, and ends with `advice`.
+    """
+    bound = max_bytes
+    if bound is None:
+        bound = SMALL if needed <= SMALL else 0.5 * free_memory()
     if needed > bound:
         raise MemoryError(
-            f"{what} needs {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of "
-            f"the free memory); {advice}."
+            f"{what} {needed / 1e9:.3g} GB, but the bound is {bound / 1e9:.3g} GB (max_bytes, by default half of the "
+            f"free memory); {advice}."
         )
+
+
+def check_bytes(max_bytes: Any) -> None:
+    """Raise ValueError unless the option ``max_bytes`` is None or a number >= 0."""
+    if max_bytes is not None and not (is_number(max_bytes, "max_bytes") and max_bytes >= 0):
+        raise ValueError(f"max_bytes must be a number of bytes >= 0, got {shown(max_bytes)}.")
+
+
+def free_memory() -> float:
+    """Return an estimate of the number of bytes that a process can still allocate."""
+    with suppress(OSError, StopIteration), open("/proc/meminfo") as lines:
+        return 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1])
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        return 0.5 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 4e9

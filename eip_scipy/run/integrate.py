@@ -17,20 +17,17 @@ from ..core.callers import users_level
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
 from ..core.functions import PointerFunction, is_compiled, is_jitted
-from ..core.invariants import Invariant
 from ..core.names import nearest
 from ..core.problem import Problem
 from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_projection_options
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver
-from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
-from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, OK, PAUSE, ROW, STEP, TIME, Schedule
-from ..engine.native import PythonFunctions
+from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, TIME
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
-from .driver import Driver
+from .driver import Driver, expected_steps
 from .prepare import DEFAULT, RunArguments, identity, prepared, started_at
 from .results import IntegrationResult, Origin, described
 
@@ -42,6 +39,7 @@ FIRST_CHUNK = 64
 SLOW_SECONDS = 2.0
 ARRIVED, STOPPED = "reached the end of the interval", "stopped by the callback"
 ENDED_BY_EVENT = "A termination event occurred."
+COMPILING = {"desc": "compiling the functions", "total": 0, "bar_format": "{desc}", "leave": False}
 
 
 @takes_projection_options
@@ -99,8 +97,7 @@ def integrate(
         Initial state, real or complex.
     acceleration : callable, optional
         Instead of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
-        (n/2,)``, in place ``acceleration(t, q, out[, params])``; a Python, Numba or C function as for `fun`.
-        Accelerations that depend on velocities belong in `fun`.
+        (n/2,)``, and otherwise as `fun`. Accelerations that depend on velocities belong in `fun`.
     method : type, optional
         `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
         `EIPRadau`, `EIPBDF`, or a class made by `eip_method`. `EIPRadau`, `EIPBDF` and classes made from a one-step
@@ -176,10 +173,9 @@ def integrate(
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
         the run instead.
-    diagnostics, first_step, max_step
-        As for the solver classes.
-    rtol, atol : float or array_like, optional
-        As for the solver classes, 1e-3 and 1e-6 by default. If `h` is given, they only scale the error metric.
+    diagnostics, first_step, max_step, rtol, atol
+        As for the solver classes; `rtol` and `atol` are 1e-3 and 1e-6 by default. If `h` is given, they only scale the
+        error metric.
 
     Returns
     -------
@@ -195,8 +191,8 @@ def integrate(
     MemoryError
         If the saved states would need more than `max_bytes`.
     CheckpointError
-        If the file cannot be written at the start, exists without ``resume=True``, is damaged, belongs to a run with
-        other arguments or functions, or is used by another run.
+        If the file cannot be written at the start, exists without ``resume=True``, is damaged or used by another run,
+        or belongs to one with other arguments or functions.
 
     Notes
     -----
@@ -219,8 +215,7 @@ def integrate(
     known = ProjectionOptions.names()
     for name in projection:
         if name not in known:
-            own = (name for name in RunArguments._fields if name != "projection")
-            others = (*own, "checkpoint", "checkpoint_every", "resume", *known)
+            others = [*asked.keys() - {"projection"}, *known]
             raise TypeError(f"integrate() has no option {name!r}{nearest(name, others)}")
     request = RunArguments(*map(asked.__getitem__, RunArguments._fields))
     opened = _resume.opened(checkpoint, checkpoint_every, resume, dense_output)
@@ -229,260 +224,237 @@ def integrate(
         try:
             return Loop(prepared(request), request, keeper).run()
         except BaseException as error:
-            _keep_start(error, request, time.perf_counter() - begin)
+            if not hasattr(error, "partial"):
+                _attach_start(error, request, time.perf_counter() - begin)
             raise
 
 
 class Loop:
     """A run in chunks of steps, with a progress bar, states at `t_eval`, events, callbacks, and checkpoints.
 
-    An exception raised in `run` gets the result up to that point as its attribute `partial`.
+    `why_not` is the reason why not all functions are called natively, or None.
     """
 
     def __init__(self, run: Run, given: RunArguments, keeper: _resume.Checkpointer | None = None) -> None:
-        self.given, self.keeper, self.problem = given, keeper, run.problem
-        self.method, self.events, self.diagnostics = run.name, run.problem.events, run.diagnostics
-        self.callback, self.progress = given.callback, given.progress
+        problem = run.problem
+        self.given, self.keeper, self.events = given, keeper, problem.events
         if keeper is not None and run.method.drives:
             raise ValueError(
                 f"checkpoint: a file cannot store the internal state of SciPy's {run.method.name}, which resuming "
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
-        wanted, fun = given.compiled, run.problem.fun
-        with _compiling(self.progress and wanted is not False and is_jitted(fun)):
-            functions, self.why_not = run.problem.functions(run, wanted)
+        compiles = given.compiled is not False and is_jitted(problem.fun)
+        with _bar(given.progress and compiles, lambda: COMPILING):
+            functions, self.why_not = problem.functions(run, given.compiled)
             self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
-            own = identity(run, run.begin.y, run.problem.parameters)
-            keeper.begin(self.driver, own, run.problem.derivative, self.events)
-        self._slowed = wanted is None and _slowed_by_invariants(fun, functions, run)
-        self.wall_time = 0.0 if keeper is None else keeper.seconds
-        self.chunk = FIRST_CHUNK
-        self._seconds = 0.0
-        self.is_unreliable = self._doubtful = self._event_ended = False
+            own = identity(run, run.begin.y, problem.parameters)
+            keeper.begin(self.driver, own, problem.derivative, self.events)
+        self._chunk, self._seconds, self._begin = FIRST_CHUNK, 0.0, 0.0
+        self._doubtful = self._event_ended = False
 
     def run(self) -> IntegrationResult:
-        driver = self.driver
-        begin = time.perf_counter()
+        """Run to the end, and return the result; an exception gets it as its attribute `partial`."""
+        driver, keeper, result = self.driver, self.keeper, None
+        self._begin = time.perf_counter() - (0.0 if keeper is None else keeper.seconds)
         try:
-            with _bar(self.progress, driver.schedule, self.method) as bar:
+            with _bar(self.given.progress, self._shown_by_bar) as bar:
                 status, message = self.steps(bar)
-            if self.keeper is not None:
-                self.keeper.end(status, message)
+            if keeper is not None:
+                keeper.end(status, message)
+            result = self._result(status, message)
+            if self._doubtful and status >= 0:
+                text = f"{driver.run.name}: {driver.run.trust.message}"
+                warnings.warn(text, ProjectionWarning, stacklevel=users_level())
         except BaseException as error:
-            self.wall_time += time.perf_counter() - begin
-            if self.keeper is not None:
-                self.keeper.interrupted(error)  # first, because a batch system may kill the process soon after SIGTERM
-            driver.run.trust.failed = True
-            driver.save_now()
-            partial = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
-            error.partial = partial  # type: ignore[attr-defined]
+            if result is None:
+                if keeper is not None:
+                    keeper.interrupted(error)  # first, because a batch system may kill the process soon after SIGTERM
+                driver.run.trust.failed = True
+                result = self._result(-1, f"interrupted by {type(error).__name__}", broken=True)
+            error.partial = result  # type: ignore[attr-defined]
             raise
-        self.wall_time += time.perf_counter() - begin
-        if status < 0:
-            driver.save_now()
-        result = self._result(status, message)
-        if self.is_unreliable:
-            try:
-                warnings.warn(f"{self.method}: {driver.run.trust.message}", ProjectionWarning, stacklevel=users_level())
-            except ProjectionWarning as error:
-                error.partial = result  # type: ignore[attr-defined]
-                raise
         return result
 
-    def steps(self, bar: Any) -> tuple[int, str]:
-        """Run until something ends the run; return status and message, and set `is_unreliable`."""
-        self._doubtful = False
+    def steps(self, bar: Any = None) -> tuple[int, str]:
+        """Run until something ends the run, check the run, and return status and message."""
         status, message = self._steps(bar)
         self.driver.run.trust.failed = status < 0
-        self._look(ended=True)
-        self.is_unreliable = self._doubtful and status >= 0
+        self._check(ended=True)
         return status, message
 
-    def _look(self, *, ended: bool = False) -> None:
-        driver = self.driver
-        t, y = driver.now
-        self._doubtful |= driver.run.look(driver.step, ended, t, y.copy())
+    def _check(self, *, ended: bool = False) -> None:
+        t, y = self.driver.now
+        self._doubtful |= self.driver.run.look(self.driver.step, ended, t, y.copy())
 
     def _steps(self, bar: Any) -> tuple[int, str]:
         driver, schedule = self.driver, self.driver.schedule
         if driver.step == 0:
-            driver.save_start()
+            t0, times = schedule.span.t0, schedule.t_eval
+            if driver.rows == 0 and (times.size == 0 or times[0] == t0):
+                driver.save(t0, driver.state)
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
             if self.keeper is not None:
                 self.keeper.keep()
-            k, rows, begin = driver.step, driver.rows, time.perf_counter()
-            steps = self._chunk(self.chunk)
-            code = driver.advance(k + steps)
+            rows, steps, begin = driver.rows, self._next_steps(), time.perf_counter()
+            code = driver.advance(driver.step + steps)
             seconds = time.perf_counter() - begin
             driver.warn()
-            self._warn_if_slow(seconds)
-            ended = self._ended(code)
-            if schedule.span.h != 0.0:
-                bar.update(driver.step - k)
-            else:
-                bar.update(abs(driver.now[0] - schedule.span.t0) - bar.n)
+            self._warn_of_interpreted_invariants(seconds)
+            self._event_ended = self._pause() if code == PAUSE else code == ENDED
+            if self._event_ended and schedule.t_eval.size == 0:
+                driver.cut(*self.events.last)
+            if bar is not None:
+                bar.update(self._progress() - bar.n)
             if self._stopped_by_callback(rows):
                 return 1, STOPPED
-            if ended:
+            if self._event_ended:
                 return 1, ENDED_BY_EVENT
-            if code not in (OK, PAUSE, ENDED, FULL):
+            if code not in (OK, PAUSE, FULL):
                 return -1, failure(code, driver.run, schedule.clock)
-            if is_check_due(driver.step) or driver.suspects:
-                self._look()
+            if is_check_due(driver.step) or driver.run.work.suspect[REASON] != NOTHING:
+                self._check()
             if code == FULL:
                 driver.grow()
             elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
                 return 0, ARRIVED
-            if code == OK:
+            elif code == OK:
                 # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
-                longer = max(self.chunk, 8 * steps)
-                self.chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
+                longer = max(self._chunk, 8 * steps)
+                self._chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
-    def _warn_if_slow(self, seconds: float) -> None:
+    def _next_steps(self) -> int:
+        """Return the number of steps to make next: at most `_chunk`, and none beyond the next check of the run.
+
+        With a callback, no step goes beyond the next state that is saved. Near the end of a multistep run it is instead
+        the number of all remaining steps, because each of the last states that is requested costs a step of the
+        starting method.
+        """
+        driver, schedule, span = self.driver, self.driver.schedule, self.driver.schedule.span
+        history, left = driver.run.stepper.multistep, span.n_steps - driver.step
+        chunk = left if history is not None and left - history.middle <= self._chunk else self._chunk
+        chunk = min(chunk, steps_to_check(driver.step))
+        if self.given.callback is None:
+            return chunk
+        if schedule.t_eval.size:
+            times = schedule.t_eval[driver.rows :]
+            known = span.h != 0.0 and times.size  # adaptive steps are made one by one
+            return max(1, min(chunk, int(abs((times[0] - driver.now[0]) / span.h)))) if known else 1
+        return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
+
+    def _warn_of_interpreted_invariants(self, seconds: float) -> None:
         """Warn once if only the invariants prevent a slow run from being compiled; `seconds` is the time of a chunk."""
         self._seconds += seconds
-        if self._slowed and self._seconds > SLOW_SECONDS:
-            self._slowed = False
+        if self._seconds <= SLOW_SECONDS:
+            return
+        self._seconds, run = -math.inf, self.driver.run
+        if self.given.compiled is not None or self.driver.functions.native or not is_jitted(run.problem.fun):
+            return
+        functions = [function for item in run.invariants.items for function in (item.function, item.gradient)]
+        if not all(is_compiled(function) or isinstance(function, PointerFunction) for function in functions):
             warnings.warn(
-                f"{self.method}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
+                f"{run.name}: fun is jitted, and the run could be many times faster, but it is {self.why_not}. "
                 "Compile the functions of the invariants with numba.njit, or pass compiled=False if this is intended.",
                 UserWarning,
                 stacklevel=users_level(),
             )
 
-    def _ended(self, code: int) -> bool:
-        """Return True if an event ends the run, by the loop's `code`, and handle a step that has paused."""
-        driver, schedule = self.driver, self.driver.schedule
-        self._event_ended = self._pause() if code == PAUSE else code == ENDED
-        if self._event_ended and schedule.t_eval.size == 0:
-            driver.cut(*self.events.last)
-        return self._event_ended
-
     def _pause(self) -> bool:
         """Save states at `t_eval` and record events in a step that has paused; return True if one ends the run."""
         driver, schedule = self.driver, self.driver.schedule
-        sol = driver.dense()
-        end = self.events.handle(*driver.interpolants.pending(), sol)
+        sol, (which, times) = driver.dense(), driver.interpolants.pending()
+        end = self.events.handle(which, times, sol)
         limit = sol.t if end is None else end
         while driver.rows < schedule.t_eval.size and schedule.span.sign * (schedule.t_eval[driver.rows] - limit) <= 0:
             t = float(schedule.t_eval[driver.rows])
             driver.save(t, sol(t))
         return end is not None
 
-    def _chunk(self, chunk: int) -> int:
-        """Return the number of steps to make next: at most `chunk`, and none beyond the next check of the run.
-
-        With a callback, no step goes beyond the next state that is saved. Near the end of a multistep run `chunk` is
-        replaced by the number of all remaining steps, even if it is larger.
-        """
-        driver, schedule = self.driver, self.driver.schedule
-        history, left = driver.run.stepper.multistep, schedule.span.n_steps - driver.step
-        if history is not None and left - history.middle <= chunk:
-            chunk = left  # each of the last states that is requested costs a step of the starting method
-        chunk = min(chunk, steps_to_check(driver.step))
-        if self.callback is None:
-            return chunk
-        if schedule.t_eval.size:
-            return max(1, min(chunk, self._steps_to_next_time()))
-        return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
-
-    def _steps_to_next_time(self) -> int:
-        """Return a number of fixed steps that does not go beyond the next time in `t_eval`; 1 for adaptive steps."""
-        driver, schedule = self.driver, self.driver.schedule
-        h = abs(schedule.span.h)
-        if h == 0.0 or driver.rows == schedule.t_eval.size:
-            return 1
-        return int(abs(schedule.t_eval[driver.rows] - driver.now[0]) / h)
-
     def _stopped_by_callback(self, first_row: int) -> bool:
-        if self.callback is None:
-            return False
-        driver = self.driver
-        for row in range(first_row, driver.rows):
+        driver, invariants, tangents = self.driver, self.driver.run.invariants, self.driver.run.tangents
+        for row in range(first_row, driver.rows) if self.given.callback is not None else ():
             t, y = float(driver.t[row]), driver.y[row].copy()
-            invariants = driver.run.invariants
-            if self.callback(t, driver.run.tangents.state(y), invariants.values(t, y) - invariants.fixed_target):
+            if self.given.callback(t, tangents.state(y), invariants.values(t, y) - invariants.fixed_target):
                 driver.schedule.place[ROW] = row + 1
                 return True
         return False
 
+    def _progress(self) -> float:
+        """Return the number of steps made, or the length of the interval done by adaptive steps."""
+        span = self.driver.schedule.span
+        return self.driver.step if span.h != 0.0 else abs(self.driver.now[0] - span.t0)
+
+    def _shown_by_bar(self) -> dict[str, Any]:
+        """Return the options of the progress bar; `initial` is above 0 if the run is resumed."""
+        span, unit = self.driver.schedule.span, "step"
+        total: float | None = expected_steps(self.driver.schedule) or None
+        if span.h == 0.0:
+            total, unit = abs(span.t_bound - span.t0) if math.isfinite(span.t_bound) else None, "time"
+        shown = {"total": total, "unit": unit, "initial": self._progress(), "unit_scale": True, "smoothing": 0.05}
+        return {"desc": self.driver.run.name, **shown}
+
     def _result(self, status: int, message: str, *, broken: bool = False) -> IntegrationResult:
-        driver, events, tangents = self.driver, self.events, self.driver.run.tangents
-        rows = driver.rows
-        values, target = self._values(broken), driver.run.invariants.fixed_target
+        """Return the result at the end of a run; if it is `broken`, invariants whose functions fail again are NaN."""
+        driver, run, events = self.driver, self.driver.run, self.events
+        if status < 0:
+            driver.save_now()
+        values, target = np.full((run.invariants.size, driver.rows), np.nan), run.invariants.fixed_target
+        with suppress(BaseException) if broken else nullcontext():
+            values = driver.values()
         driver.note(values, target)
+        t, y = events.last if self._event_ended else driver.now
+        sol, asked, kept = driver.solution(t), self.given, run.invariants.with_targets
+        variations = run.problem.variations
+        if variations is not None:
+            sol = None if sol is None else StateSolution(sol, run.tangents)
+            asked = asked._replace(variations=run.tangents.restarted(y))
         result = assembled(
-            driver.run,
-            driver.y[:rows],
+            run,
+            driver.y[: driver.rows],
             (events.t, events.y) if events.functions else None,
-            driver.run.work.counters,
-            t=driver.t[:rows],
+            run.work.counters,
+            t=driver.t[: driver.rows],
             invariants=values,
             target=target,
-            max_residual=driver.run.work.max_residual,
-            diagnostics=self.diagnostics,
-            sol=self._solution(),
+            max_residual=run.work.max_residual,
+            diagnostics=run.diagnostics,
+            sol=sol,
             status=status,
             message=self.explained(message),
             success=status >= 0,
-            trusted=driver.run.trust.trusted,
-            wall_time=self.wall_time,
+            trusted=run.trust.trusted,
+            wall_time=time.perf_counter() - self._begin,
             compiled=self.why_not is None,
-            calls=self.problem.calls(driver.run, driver.functions),
+            calls=run.problem.calls(run, driver.functions),
             h=abs(driver.schedule.span.h) or None,
         )
-        t, y = events.last if self._event_ended else driver.now
-        last, values_at = (np.array([t]), y[None].copy()), driver.values_at
-        asked = self.given
-        if self.problem.variations is not None:
-            asked = asked._replace(variations=tangents.restarted(y))
-        y, sign = tangents.state(y.copy()), driver.schedule.span.sign
+        last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
         arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
         arguments |= arguments.pop("projection")
-        origin = Origin(arguments, t, y, sign, self._kept, lambda: values_at(*last)[0], message, self.notes)
+        origin = Origin(
+            arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign,
+            lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
+            lambda: values_at(*last)[0], message, self._notes(),
+        )  # fmt: skip
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 
-    def _kept(self) -> tuple[Invariant, ...]:
-        """Return the invariants with the values that the run keeps as their targets."""
-        kept = self.driver.run.invariants.with_targets(at_end=not self._event_ended)
-        return kept if self.problem.variations is None else self.problem.variations.with_targets(kept)
-
-    def _solution(self) -> Any:
-        """Return the run as a function of time, or None if its steps are not stored."""
-        found = self.driver.solution(self.events.last[0] if self._event_ended else self.driver.now[0])
-        if found is None or self.problem.variations is None:
-            return found
-        return StateSolution(found, self.driver.run.tangents)
-
     def explained(self, message: str) -> str:
         """Return the message with remarks: on a start that was moved, on doubts about the run, and notes."""
-        return described(message, self.diagnostics, self.notes)
+        return described(message, self.driver.run.diagnostics, self._notes())
 
-    @property
-    def notes(self) -> tuple[str, ...]:
+    def _notes(self) -> tuple[str, ...]:
         """Return notes on checkpoints, functions that were not compiled and gradients by differences."""
-        notes = [] if self.keeper is None else list(self.keeper.notes)
-        notes += [] if self.why_not is None else [self.why_not]
-        if labels := self.driver.run.invariants.by_differences:
+        run = self.driver.run
+        notes = [*(() if self.keeper is None else self.keeper.notes), self.why_not]
+        if labels := run.invariants.by_differences:
             names = ", ".join(map(repr, labels))
             notes.append(
                 f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
             )
-        missing = self.driver.run.conserved.missing
-        return (*notes, *([] if missing is None else [str(missing)]))
-
-    def _values(self, broken: bool) -> np.ndarray:
-        """Return the invariants (l, m) of the saved states; NaN if an error has `broken` the run and occurs again."""
-        try:
-            return self.driver.values()
-        except BaseException:
-            if not broken:
-                raise
-            return np.full((self.driver.run.invariants.size, self.driver.rows), np.nan)
+        return tuple(str(note) for note in (*notes, run.conserved.missing) if note is not None)
 
 
 def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
@@ -511,64 +483,26 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
     return result
 
 
-def _slowed_by_invariants(fun: Any, functions: Any, run: Any) -> bool:
-    """Return True if a jitted `fun` is called from Python only because invariants are not compiled."""
-    if not (isinstance(functions, PythonFunctions) and is_jitted(fun)):
-        return False
-    kept = [found for item in run.invariants.items for found in (item.function, item.gradient)]
-    return not all(is_compiled(found) or isinstance(found, PointerFunction) for found in kept)
-
-
-def _compiling(shown: bool) -> Any:
-    """Return a context manager that, if `shown`, shows a line while functions are compiled, which may take seconds."""
+def _bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
+    """Return a context manager that yields a progress bar with these options of tqdm, or None if it is not `shown`."""
     if not shown:
         return nullcontext()
     from tqdm import tqdm
 
-    return tqdm(total=0, desc="compiling the functions", bar_format="{desc}", leave=False)
+    return tqdm(**options())
 
 
-class _NoBar:
-    """Stand-in for a progress bar that is not shown."""
-
-    n = 0.0
-
-    def update(self, amount: float = 0.0) -> None:
-        pass
-
-
-def _bar(progress: bool, schedule: Schedule, label: str) -> Any:
-    if not progress:
-        return nullcontext(_NoBar())
-    from tqdm import tqdm
-
-    span, shown = schedule.span, {"desc": label, "unit_scale": True, "smoothing": 0.05}
-    # `initial` is above 0 if the run is resumed.
-    if span.h != 0.0:
-        total = span.n_steps if span.n_steps < UNBOUNDED else None
-        return tqdm(total=total, initial=int(schedule.place[STEP]), unit="step", **shown)
-    length = abs(span.t_bound - span.t0) if math.isfinite(span.t_bound) else None
-    return tqdm(total=length, initial=abs(float(schedule.clock[TIME]) - span.t0), unit="time", **shown)
-
-
-def _keep_start(error: BaseException, request: RunArguments, seconds: float) -> None:
-    """Attach a result with the initial state as `partial` to an exception that has no `partial`."""
-    if hasattr(error, "partial"):
-        return
+def _attach_start(error: BaseException, request: RunArguments, seconds: float) -> None:
+    """Attach a result with the initial state as `partial` to an exception in the preparation of a run."""
+    nothing = np.zeros((0, 1))
     with suppress(TypeError, ValueError):  # the initial state itself cannot be read
         t0, start = started_at(request)
         error.partial = IntegrationResult(  # type: ignore[attr-defined]
-            {"t": np.array([t0]), "y": start[:, None], "invariants": np.zeros((0, 1)), "target": np.zeros(0)},
-            max_residual=np.zeros(0),
-            diagnostics=Diagnostics(),
-            **dict.fromkeys(("t_events", "y_events", "sol")),
+            dict.fromkeys(("t_events", "y_events", "sol", "h", "component_names", "epoch")),
             **dict.fromkeys(("nfev", "njev", "nlu"), 0),
-            status=-1,
-            message=f"interrupted by {type(error).__name__} at the start",
-            **dict.fromkeys(("success", "trusted"), False),
-            wall_time=seconds,
-            compiled=False,
-            calls={},
+            **dict.fromkeys(("success", "trusted", "compiled"), False),
+            **{"t": np.array([t0]), "y": start[:, None], "invariants": nothing, "target": nothing[:, 0]},
+            **{"max_residual": nothing[:, 0], "diagnostics": Diagnostics(), "calls": {}, "units": ""},
+            **{"status": -1, "message": f"interrupted by {type(error).__name__} at the start", "wall_time": seconds},
             method=getattr(request.method, "__name__", str(request.method)),
-            **{"h": None, "component_names": None, "units": "", "epoch": None},
         )

@@ -37,8 +37,7 @@ from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction
 from ..methods.base import Method
 from ..methods.implicit import Jacobian
-from .driver import check_memory, saved_rows
-from .memory import check_bytes
+from .driver import check_bytes, check_memory, saved_rows
 from .resume import plain, settings
 
 __all__ = ["DEFAULT", "RunArguments", "as_problem", "default_method", "identity", "prepared", "started_at"]

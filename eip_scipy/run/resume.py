@@ -69,7 +69,7 @@ def settings(
         "max_step": span.max_step,
         "y0": y0,
         "params": params,
-        **run.identity(),
+        **run.projection.identity(run.options, run.invariants),
         "save_every": schedule.save_every or None,
         "t_eval": schedule.t_eval if schedule.t_eval.size else None,
         "events": events.ends,
@@ -218,7 +218,8 @@ class Checkpointer:
     def _take_snapshot(self) -> None:
         begin = time.perf_counter()
         # One assignment, so that an interruption leaves a whole snapshot: buffers, numbers of events, and run time.
-        self._snapshot = self._driver.snapshot(), [len(times) for times in self._events.t], begin - self._begin
+        parts = {name: part.copy() for name, part in self._driver.parts().items()}
+        self._snapshot = parts, [len(times) for times in self._events.t], begin - self._begin
         self._next_snapshot = _next_time(begin, SNAPSHOT_SECONDS)
 
     def _where(self) -> str:
