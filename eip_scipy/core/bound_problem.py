@@ -18,6 +18,7 @@ from .events import Events
 from .functions import BY_NAME, NotCompilableError, PointerFunction, compiled_calls, floats, names, native_functions
 from .inputs import as_vector, filled, numbers, require_arguments, shown
 from .problem import Problem, made
+from .tangent_vectors import NO_TANGENT_VECTORS
 
 if TYPE_CHECKING:
     from .runs import Run
@@ -46,7 +47,8 @@ class BoundProblem:
     `extra` are the last arguments of all functions. `problem` is the `Problem` that was given instead of a function,
     `acc` is the acceleration of a problem that has one, if the method needs nothing else, ``jacobian(t, q, dq, out,
     *extra)`` is for multistep methods, and `jac` for implicit ones. `variations` are the functions of an augmented
-    state. A `vectorized` function takes states (n, 1). With `explains`, errors name the arguments of a call that fails.
+    state, `tangents` the vectors in it, and `n` is the number of components without them. A `vectorized` function takes
+    states (n, 1). With `explains`, errors name the arguments of a call that fails.
     """
 
     def __init__(
@@ -68,6 +70,8 @@ class BoundProblem:
         self.y0, self.form, self.extra, self.problem = y0, form, extra, problem
         self.events = Events(None) if events is None else events
         self.acc, self.jacobian, self.jac, self.variations = acc, jacobian, jac, variations
+        self.tangents = NO_TANGENT_VECTORS if variations is None else variations.tangents
+        self.n = self.tangents.state(y0).size
         self.vectorized, self._explains = vectorized, explains
         self.parameters = floats(extra)
         self.second_order, self._in_place = form.startswith("acceleration"), form.endswith("in place")
@@ -122,9 +126,8 @@ class BoundProblem:
     def left_out(self) -> str:
         """A possible cause of NaN in the value of the function, for messages; "" if none is known."""
         if self.variations is not None:
-            n = self.variations.tangents.n
             return (
-                f"components from {n} on are derivatives, which overflow in long chaotic runs: shorten the "
+                f"components from {self.n} on are derivatives, which overflow in long chaotic runs: shorten the "
                 "interval, or use megno or lyapunov_spectrum, which rescale them"
             )
         if isinstance(self.fun, PointerFunction):
@@ -135,14 +138,13 @@ class BoundProblem:
     def component_names(self) -> tuple[str, ...] | None:
         """Names of the components from the problem, or None if it has none for this state."""
         names = None if self.problem is None else self.problem.component_names
-        n = self.y0.size if self.variations is None else self.variations.tangents.n
-        return names if names is not None and len(names) == n else None
+        return names if names is not None and len(names) == self.n else None
 
     @property
     def described_columns(self) -> dict[str, Any]:
         """The field ``columns`` of the result of a run that carries derivatives."""
         assert self.variations is not None
-        tangents = self.variations.tangents
+        tangents = self.tangents
         known = {} if self.problem is None else dict(enumerate(self.problem.parameters))
         return {
             "state": tangents.is_transition,
@@ -177,14 +179,14 @@ class BoundProblem:
             return self.in_python(run), "interpreted: compiled=False"
         try:
             functions, reason = native_functions(run)
-            if not reason:
-                return functions, None
-            if wanted:
-                raise NotCompilableError(reason)
         except NotCompilableError as error:
             if wanted:
                 raise
             return self.in_python(run), f"interpreted: {error}"
+        if not reason:
+            return functions, None
+        if wanted:
+            raise NotCompilableError(reason)
         return functions._replace(python=self.in_python(run)), f"events are called from Python: {reason}"
 
     def pointers(self, run: Run) -> list[PointerFunction]:

@@ -23,7 +23,6 @@ from .invariant_set import TARGET_TOLERANCE, InvariantSet
 from .projection import ProjectionOptions, are_combinations, linear_rows
 from .results import Diagnostics, slowness
 from .step_control import StepControl
-from .tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
 
 if TYPE_CHECKING:
     from .bound_problem import BoundProblem
@@ -33,7 +32,7 @@ __all__ = ["Run", "Start"]
 START_ITERATIONS = 50
 COMBINATION_DISTANCE = 1e-4
 
-# What `restore` makes again, and what a copy does not need.
+# Attributes that `restore` makes again, and those that a copy does not need.
 RESTORED = ("method", "invariants", "diagnostics", "examiner")
 
 Array = np.ndarray
@@ -85,8 +84,7 @@ class Run:
     ) -> None:
         self.problem, self.name, self.method, self.stepping = problem, name, method, stepping
         self.projection, self.level = projection, level
-        known = problem.variations
-        self.tangents: TangentVectors = NO_TANGENT_VECTORS if known is None else known.tangents
+        self.tangents = problem.tangents
         self.looked, self.moved, self.depends_on_time, self._warned_of_balances = -1, "", False, False
 
     @property
@@ -147,10 +145,8 @@ class Run:
 
     def _make_buffers(self, tell: bool) -> None:
         """Evaluate the invariants at the start, and make the buffers for them; `tell`: see `InvariantSet`."""
-        start, method, projection, rhs = self.start, self.method, self.projection, self.problem.derivative
-        self.invariants = invariants = InvariantSet(
-            projection.invariants, *start, self.problem.extra, tell=tell, t_bound=self.stepping.span.t_bound, rhs=rhs
-        )
+        start, method, projection = self.start, self.method, self.projection
+        self.invariants = invariants = self._invariants_at(start, tell)
         y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         self.depends_on_time = method is not PROJECTION_ONLY and invariants.add_rounding_of_time(start.y)
@@ -172,6 +168,10 @@ class Run:
         if sigma is not None:
             work.sigma[:] = sigma
         self.trust = Trust(invariants.names, work.trust)
+
+    def _invariants_at(self, start: Start, tell: bool) -> InvariantSet:
+        extra, rhs, t_bound = self.problem.extra, self.problem.derivative, self.stepping.span.t_bound
+        return InvariantSet(self.projection.invariants, *start, extra, tell=tell, t_bound=t_bound, rhs=rhs)
 
     def _check(self, checks: bool) -> None:
         """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
@@ -239,9 +239,7 @@ class Run:
         self.method = given
         if given.has_history:
             self.method = replace(cast(Any, given), velocities=own["velocities"])
-        items, t_bound, extra = self.projection.invariants, self.stepping.span.t_bound, self.problem.extra
-        rhs = self.problem.derivative
-        self.invariants = found = InvariantSet(items, *self.begin, extra, tell=False, t_bound=t_bound, rhs=rhs)
+        self.invariants = found = self._invariants_at(self.begin, tell=False)
         found.tau, found.kinds, found.target = own["tau"], self.options.kinds, self.options.target
         if own["joint"]:
             self.options = self.options._replace(joint=found.items)
@@ -338,10 +336,8 @@ class Run:
         if not fast.size:
             return ""
         self._warned_of_balances = True
-        names, bound = (
-            [self.invariants.names[place] for place in balances.places[fast]],
-            balances.most_slowness[fast[0]],
-        )
+        names = [self.invariants.names[place] for place in balances.places[fast]]
+        bound = balances.most_slowness[fast[0]]
         return (
             f"balance {listed(names)} changes too fast to be of much use: on average its rate is "
             f"{found[fast].max():.2g} of the sum of the absolute values of the terms of grad @ f (the largest of "

@@ -53,7 +53,7 @@ OPTIONS = ("h", "first_step", "max_step", "rtol", "atol", "vectorized", "diagnos
 
 
 class Context(NamedTuple):
-    """What `eip_scipy.solve_ivp` shares with the solver that SciPy makes for it.
+    """The data that `eip_scipy.solve_ivp` shares with the solver that SciPy makes for it.
 
     The solver writes the state from which it starts to `start`, the initial state of SciPy's loop, and itself to
     `solvers`. `variations` are the functions of an augmented state.
@@ -173,7 +173,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         if not hasattr(self, "TABLEAU"):
             raise TypeError("EIPSolver is the base class; use EIPRK4 and the like, or eip_method(tableau).")
         start = initial_state(y0)
-        context = options.pop("_context", None) or Context(start.copy(), [])
+        context: Context | None = options.pop("_context", None)
         jacobians = _jacobians(self.TABLEAU, options)
         own, extraneous = ProjectionOptions.split(options)
         projection = ProjectionOptions(**own | {"invariants": as_invariants(own.get("invariants", ()))})
@@ -181,17 +181,17 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             warnings.warn(_without_effect(extraneous), UserWarning, stacklevel=users_level())
         t0, t_bound = interval((t0, t_bound))
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
-        problem = BoundProblem(fun, start, variations=context.variations, vectorized=vectorized, **jacobians)
-        n = start.size if context.variations is None else context.variations.tangents.n
+        variations = None if context is None else context.variations
+        problem = BoundProblem(fun, start, variations=variations, vectorized=vectorized, **jacobians)
         longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
         name, control = type(self).__name__, {"h": h, "first_step": first_step, "max_step": longest}
-        stepping = StepControl.of(name, self.TABLEAU, (t0, t_bound), n, **control, rtol=rtol, atol=atol)
+        stepping = StepControl.of(name, self.TABLEAU, (t0, t_bound), problem.n, **control, rtol=rtol, atol=atol)
         self._run = run = Run(problem, name, self.TABLEAU, stepping, projection, level=True)
         self._bound_fun = self.fun
         self._take_stepping(stepping, rtol, atol)
         if self.h is None and stepping.first_step is None:
             stepping.require_scale(run.tangents.state(start))
-        plain = not (projection.invariants or projection.compensated or n < self.n)
+        plain = not (projection.invariants or projection.compensated or problem.n < self.n)
         self._scipy = self._scipy_solver(start) if plain else None
         self.h_previous: float | None = None
         self.diagnostics = Diagnostics() if diagnostics is None else diagnostics
@@ -204,8 +204,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._noted, self._warned = 0, False
         self._count()
         self._settle()
-        context.start[:] = self.y
-        context.solvers.append(self)
+        if context is not None:
+            context.start[:] = self.y
+            context.solvers.append(self)
 
     @classmethod
     def _takes_scipys_steps(cls, options: Mapping[str, Any]) -> bool:

@@ -1,4 +1,4 @@
-"""Where the chunks of an ensemble run: in threads of this process, or on executors of `concurrent.futures`."""
+"""Execution of the chunks of an ensemble: in threads of this process, or on executors of `concurrent.futures`."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ class RunArguments(NamedTuple):
 
     @classmethod
     def of(cls, **keywords: Any) -> RunArguments:
-        """Return a request made from keywords, including projection options."""
+        """Return the arguments made from keywords, including options of the projection."""
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
@@ -124,8 +124,7 @@ def prepared(given: RunArguments, *, check_start: bool = True) -> Run:
             f"t_span must be finite unless a terminal event ends the run, got {shown(t_span)}; a callback may "
             "end it too, at the steps that save_every=... saves."
         )
-    n = problem.y0.size if problem.variations is None else problem.variations.tangents.n
-    stepping = StepControl.of(solver.__name__, method, ends, n, **given.steps(own, method))
+    stepping = StepControl.of(solver.__name__, method, ends, problem.n, **given.steps(own, method))
     run = Run(problem, solver.__name__, method, stepping, projection).start_at(problem.y0, check=check_start)
     run.schedule = schedule = _schedule(stepping.span, run.start.tau, given, events)
     check_memory(saved_rows(schedule), run, given.max_bytes)
