@@ -34,6 +34,9 @@ NULL_RATE = 1e-9
 # Coefficients below this share of the largest one are 0; pivots are larger than LEAST_PIVOT. Others are rounded to BITS
 # bits, so that they do not depend on the points. A rate may differ from 0 by HOLDS times the sum of its terms.
 NEGLIGIBLE, LEAST_PIVOT, BITS, HOLDS = 1e-9, 1e-4, 32, 1e-8
+# Gradients of states of more components are made of the components of f where they can be: up to two passes of dual numbers
+# take no more time than f.
+FEW = 24
 # A vector is a combination of others if its remainder is below this share of it.
 REMAINDER = 1e-7
 # The largest share of their terms that total forces and torques, and changes of a mass between states, may have.
@@ -61,13 +64,20 @@ class Conserved(NamedTuple):
     """Linear invariants that the corrections of a run leave unchanged, and particles whose momenta it does not keep.
 
     `found` is the number of linear invariants with those that the given invariants determine, None if they were not
-    looked for, and `calls` the number of evaluations.
+    looked for, and `calls` the number of evaluations. `masses`, (l, n / 2) or empty, has a row M for each value whose
+    gradient is (-M a, M v), where f = (v, a), and NaN for the others; `rows_from_f` are the indices of the former.
     """
 
     linear: LinearInvariants = LinearInvariants(np.zeros((0, 0)), np.zeros((0, 0)))
     found: int | None = None
     calls: int = 0
     missing: Particles | None = None
+    masses: Array = np.zeros((0, 0))
+
+    @property
+    def rows_from_f(self) -> list[int]:
+        """Return the indices of the values whose gradients are made of f."""
+        return np.flatnonzero(np.isfinite(self.masses[:, :1])).tolist()
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -103,13 +113,34 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
         and not (n > MOST_COMPONENTS and invariants.by_values.any())  # gradients by differences take long
         and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
     )  # fmt: skip
-    if not (is_searched or known or names):
+    is_pair = n > FEW and n % 2 == 0 and not run.tangents.count and not method.in_python
+    rows = np.flatnonzero(invariants.computed) if is_pair else ()
+    if not (is_searched or known or names or len(rows)):
         return NOTHING
     samples = _Samples(run, y, f, is_searched)
     with np.errstate(all="ignore"):
-        found = unless_error(_found, samples, known, names)
+        found = unless_error(_found, samples, known, names) or NOTHING
+        masses = unless_error(_masses_from_f, samples, rows) if len(rows) else None
     run.problem.count -= samples.calls
-    return Conserved(calls=samples.calls) if found is None else found
+    return found._replace(calls=samples.calls, masses=NOTHING.masses if masses is None else masses)
+
+
+def _masses_from_f(samples: _Samples, rows: Array) -> Array | None:
+    """Return `Conserved.masses` for gradients with the indices `rows`; None if none of them is made of f.
+
+    For q'' = a(t, q) and H = T + V, and for canonical (q, p), the gradient of the energy has the components of f, up to
+    constant factors M. They are found and compared at the start and at the first points.
+    """
+    y, f, G = map(np.array, zip(*samples.states(), strict=True))
+    v, a = np.split(f, 2, axis=1)
+    masses = np.full((G.shape[1], v.shape[1]), np.nan)
+    for k in rows:
+        by_q, by_v = np.split(G[:, k], 2, axis=1)
+        M = _rounded((by_v * v - by_q * a).sum(axis=0) / (v * v + a * a).sum(axis=0))
+        errors, sizes = np.abs([by_q + M * a, by_v - M * v]), np.abs([by_q, by_v])
+        if (errors <= HOLDS * sizes.max(axis=2, keepdims=True)).all():  # also False if one is not finite
+            masses[k] = M
+    return None if np.isnan(masses).all() else masses
 
 
 def _found(samples: _Samples, known: LinearInvariants | None, names: bool) -> Conserved:

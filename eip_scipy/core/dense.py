@@ -138,7 +138,7 @@ def _record(run: Run, form: DenseForm, events: int) -> Dense:
     balances, stages = run.invariants.balances.places.size, run.stepper.b.size
     options = run.options._replace(
         metric=data.GIVEN, direction=data.NEW, every=1, compensated=False, iterations=ITERATIONS, watched=False,
-        limit=math.inf, target=np.zeros(invariants),
+        limit=math.inf, target=np.zeros(invariants), uses_f=run.invariants.uses_f,
     )  # fmt: skip
     width, further = dtype.itemsize // 8, form.c.size
     return Dense(

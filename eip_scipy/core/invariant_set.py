@@ -179,8 +179,7 @@ class InvariantSet:
     """All invariants of a run together: sizes, names, targets, scales, and the functions that the step calls.
 
     The start is the time, the state, the derivative and the length of a step. The values and their shapes are checked
-    there. `extra` are the run's further arguments. With `tell`, the cost and the accuracy of gradients that are not
-    given are warned of. Invariants are evaluated only at times from t0 to `t_bound`, by default only at t0. `rhs` is
+    there. `extra` are the run's further arguments. Invariants are evaluated only at times from t0 to `t_bound`, by default only at t0. `rhs` is
     the right-hand side of the system, for checks.
 
     Item k has the values with the indices from `starts[k]` to `starts[k + 1]`, of the shape `shapes[k]`. The `target`
@@ -199,7 +198,6 @@ class InvariantSet:
         tau: float,
         extra: tuple = (),
         *,
-        tell: bool = True,
         t_bound: float | None = None,
         rhs: Callable[[float, Array], Array] | None = None,
     ) -> None:
@@ -223,12 +221,11 @@ class InvariantSet:
                 raise ValueError(f"invariant {name!r} is not finite at y0: it returned {number}.")
         if y0.dtype == FLOAT and any(item.gradient is None for item in given):
             self.items = tuple(self._with_gradient(item, k) for k, item in enumerate(given))
-        self.computed = self.of_values([item.gradient is None for item in given])
+        self.given_gradients = [item.gradient is not None for item in given]
+        self.computed = ~self.of_values(self.given_gradients)
         self.uses_f = any(item.uses_f for item in self.items)
         self.scales = self._spread("scale", np.zeros(self.size))
         self.grads = [self._gradient_of(item, t0, y0) for item in self.items]
-        if tell:
-            self._warn_of_gradients(given, y0.size)
         self.target = self._spread("target", self.start_values.copy())
         self.given = self.of_values([item.target is not None and not item.is_measured for item in self.items])
         self.calls = tuple(map(self._value_call, range(len(given)))), tuple(map(self._gradient_call, range(len(given))))
@@ -293,24 +290,34 @@ class InvariantSet:
         takes_complex = not isinstance(item.function, PointerFunction)
         return NumericalGradient(item.function, item.args, takes_complex, t, y, self.floors, self.extra)
 
-    def _warn_of_gradients(self, given: Sequence[Invariant], n: int) -> None:
-        """Warn about gradients by differences, and if a large state has invariants as `given` without a gradient."""
-        for grad, label in zip(self.grads, self.labels, strict=True):
-            if isinstance(grad, NumericalGradient) and not grad.complex_step and label not in self.by_differences:
-                warnings.warn(
-                    f"invariant {label!r} has no grad and allows no complex step: its gradient comes from central "
-                    "differences of order 6 (relative error about 1e-12). Give grad for full accuracy and speed.",
-                    UserWarning,
-                    stacklevel=users_level(),
-                )
-        slow = ", ".join(repr(label) for item, label in zip(given, self.labels, strict=True) if item.gradient is None)
-        if slow and n >= LARGE:
+    def warn_of_gradients(self, from_f: Sequence[int]) -> None:
+        """Warn about gradients by differences, and about computed gradients of a large state.
+
+        Those of the values with the indices `from_f` are made of f, and need no warning.
+        """
+        own = zip(self.grads, self.given_gradients, self.labels, self.starts, strict=False)
+        missing = [(grad, label) for grad, is_given, label, first in own if not (is_given or first in from_f)]
+        by_differences = [
+            label
+            for grad, label in missing
+            if isinstance(grad, NumericalGradient) and not grad.complex_step and label not in self.by_differences
+        ]
+        if by_differences:
+            one = len(by_differences) == 1
+            warnings.warn(
+                f"invariant{'s' * (not one)} {listed(by_differences)} ha{'s' if one else 've'} no grad and "
+                f"allow{'s' * one} no complex step: {'its gradient comes' if one else 'their gradients come'} from "
+                "central differences of order 6 (relative error about 1e-12). Give grad for full accuracy and speed.",
+                UserWarning,
+                stacklevel=users_level(),
+            )
+        n = self.shape[1]
+        if missing and n >= LARGE:
+            slow = ", ".join(repr(label) for _, label in missing)
             warnings.warn(
                 f"no grad is given for {slow}: each gradient by the {n} components takes at least {n} evaluations of "
                 "the invariant, which makes the run 10 to 1000 times slower. Give grad. For w * np.sum(y**2) it is "
-                "Invariant(fun, grad=lambda t, y: 2 * w * y). For the energy of a Hamiltonian system of m coordinates "
-                "and m momenta on a grid with cells of size w it is Invariant(fun, grad=lambda t, y, f: "
-                "w * np.concatenate([-f[m:], f[:m]]), uses_f=True).",
+                "Invariant(fun, grad=lambda t, y: 2 * w * y).",
                 UserWarning,
                 stacklevel=users_level(),
             )

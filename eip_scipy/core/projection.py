@@ -194,6 +194,7 @@ class ProjectionOptions:
             # Multistep methods pass the errors instead of the targets; the remaining errors are negligible.
             most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
             kinds=_unit_groups(groups, y0, f0),
+            masses=np.zeros((known.size, 0)),
             kappa=method.metric_exponent,
             metric=metric,
             direction=self._direction(method),

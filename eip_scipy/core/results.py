@@ -26,8 +26,6 @@ class Diagnostics:
         Largest invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     moved : str
         How far ``project_initial=True`` moved y0; "" if it did not.
-    remarks : tuple of str
-        The number of linear invariants that were found and are kept, and which invariants of particles are missing.
     """
 
     def __init__(self) -> None:
@@ -35,7 +33,7 @@ class Diagnostics:
         self.max_residual, self._residual, self._max_correction = none, none, np.zeros(1)
         self._counters, self._estimated = np.zeros(data.N_COUNTERS, np.int64), False  # True with an error estimate
         self._trust = Trust((), np.zeros((0, data.N_FIGURES)))
-        self.moved, self.remarks = "", tuple[str, ...]()
+        self.moved, self._remarks, self._from_f = "", tuple[str, ...](), ""
         self._slow = np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))  # indices of the balances, and their sums
 
     def _attach(self, **buffers: Any) -> None:
@@ -46,6 +44,16 @@ class Diagnostics:
     def names(self) -> tuple[str, ...]:
         """Names of the l invariants, in order."""
         return self._trust.names
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on linear invariants, gradients that are made of f, and missing invariants of particles.
+
+        The number of linear invariants that were found and are kept; the invariants whose gradients need no evaluation
+        of their own, because f has their components, and whether a projection has refuted this since.
+        """
+        until = "" if self._counters[data.FROM_F] else "; a projection has refuted this, and it is computed since then"
+        return self._remarks + ((f"the gradient of {self._from_f} is made of the components of f{until}",) * bool(self._from_f))
 
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""
@@ -58,7 +66,7 @@ class Diagnostics:
             _trust=self._trust.followed_by(other._trust),
             _estimated=self._estimated and other._estimated,
             moved=self.moved or other.moved,
-            remarks=tuple(dict.fromkeys(self.remarks + other.remarks)),
+            _remarks=tuple(dict.fromkeys(self.remarks + other.remarks)),
             _slow=(other._slow[0], _joined_sums(self._slow[1], other._slow[1])),
         )
         return both

@@ -146,7 +146,7 @@ class Run:
     def _make_buffers(self, tell: bool) -> None:
         """Evaluate the invariants at the start, and make the buffers for them; `tell`: see `InvariantSet`."""
         start, method, projection = self.start, self.method, self.projection
-        self.invariants = invariants = self._invariants_at(start, tell)
+        self.invariants = invariants = self._invariants_at(start)
         y, f = map(self.tangents.state, start[1:3])
         invariants.tau = self.stepping.scale_of_time(start.tau, y, f)
         self.depends_on_time = method is not PROJECTION_ONLY and invariants.add_rounding_of_time(start.y)
@@ -154,6 +154,11 @@ class Run:
         self.conserved = conserved(self, y, f, tell and options.watched)
         if len(C := self.conserved.linear.C):
             options = options._replace(frame=linear_rows((C, C.T), y.size, 1))
+        masses = self.conserved.masses
+        if masses.size:
+            options = options._replace(masses=masses, uses_f=True)
+        if tell:
+            invariants.warn_of_gradients(self.conserved.rows_from_f)
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
         self.stepper = method.for_engine(self.problem.sees_velocity)
@@ -161,6 +166,7 @@ class Run:
         size = self.stepper.b.size
         self.work = work = Work(start.y.size, start.y.dtype, size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
+        work.counters[data.FROM_F] = masses.size > 0
         del invariants.start_gradients  # which may be large
         if carried.size:
             work.level[:] = invariants.target[carried]
@@ -169,9 +175,9 @@ class Run:
             work.sigma[:] = sigma
         self.trust = Trust(invariants.names, work.trust)
 
-    def _invariants_at(self, start: Start, tell: bool) -> InvariantSet:
+    def _invariants_at(self, start: Start) -> InvariantSet:
         extra, rhs, t_bound = self.problem.extra, self.problem.derivative, self.stepping.span.t_bound
-        return InvariantSet(self.projection.invariants, *start, extra, tell=tell, t_bound=t_bound, rhs=rhs)
+        return InvariantSet(self.projection.invariants, *start, extra, t_bound=t_bound, rhs=rhs)
 
     def _check(self, checks: bool) -> None:
         """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
@@ -239,7 +245,7 @@ class Run:
         self.method = given
         if given.has_history:
             self.method = replace(cast(Any, given), velocities=own["velocities"])
-        self.invariants = found = self._invariants_at(self.begin, tell=False)
+        self.invariants = found = self._invariants_at(self.begin)
         found.tau, found.kinds, found.target = own["tau"], self.options.kinds, self.options.target
         if own["joint"]:
             self.options = self.options._replace(joint=found.items)
@@ -286,7 +292,8 @@ class Run:
             _trust=self.trust,
             _estimated=self.options.metric == data.BY_ERROR,
             moved=self.moved,
-            remarks=self.conserved.remarks,
+            _remarks=self.conserved.remarks,
+            _from_f=listed([self.invariants.names[k] for k in self.conserved.rows_from_f]),
             _slow=(self.invariants.balances.places, w.slow),
         )
 

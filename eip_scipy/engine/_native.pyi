@@ -53,7 +53,8 @@ F_AT_RAW: int = 13
 INDEPENDENT: int = 14
 TRIED_INDEPENDENT: int = 15
 STUCK: int = 16
-N_COUNTERS: int = 17
+FROM_F: int = 17
+N_COUNTERS: int = 18
 TIME: int = 0
 TIME_NEW: int = 1
 LENGTH: int = 2
@@ -574,6 +575,7 @@ class Options(NamedTuple):
     computed: numpy.typing.NDArray[numpy.float64]
     most_left: numpy.typing.NDArray[numpy.float64]
     kinds: Grouping
+    masses: numpy.typing.NDArray[numpy.float64]
     kappa: float
     metric: int
     direction: int

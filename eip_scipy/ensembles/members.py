@@ -97,6 +97,7 @@ class Plan:
             "the runs have balances": invariants.balances.items,
             # The shifts of the differences depend on the start.
             "the gradient of an invariant is computed by differences": invariants.by_differences,
+            "the gradient of an invariant is made of f, by masses of each member": run.conserved.masses.size,
             "the scale of an invariant that depends on time depends on the start": run.depends_on_time,
             "the start of each member is projected, or an invariant has a target": own_starts,
         }

@@ -10,6 +10,8 @@
 namespace eip {
 
 constexpr int MAX_FURTHER = 3;
+// A gradient from f is refuted by a projection that leaves this share of a residual, and more than this many dead bands.
+constexpr double MOST_MISSED = 0.02, MISSED_BANDS = 4.0;
 
 // A Newton step: its rank, -1 where gradients are not finite, the largest relative error, and its size in local errors.
 struct Moved {
@@ -276,7 +278,7 @@ template <class W>
 template <class AnyRun>
 inline void evaluate_gradients(const AnyRun &run, double t, const double *y, double *f) {
     if (run.options.uses_f) evaluate_f(run, t, y, f);
-    run.system.grad(run.work, t, y, f, run.work.G);
+    gradients(run, t, y, f, run.work.G);
     ++run.work.counters[NJEV];
 }
 
@@ -301,7 +303,7 @@ inline void newton_matrix_solve(int64_t rank, const Work &w) {
     const auto &w = run.work;
     weigh_rows(o.frame, w, w.B);
     if (o.direction == OLD) {
-        run.system.grad(w, step.t, step.y, w.row(0), w.G);
+        gradients(run, step.t, step.y, w.row(0), w.G);
         ++w.counters[NJEV];
     } else {
         midpoint(step.y, w.y_hat, w.stage, w.m);
@@ -430,7 +432,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
             compensated_step(step.y, step.h, run.method, w);
     }
     if (o.iterations == 1 && o.direction == NEW) return;
-    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    gradients(run, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     evaluate_invariants(run, step.t_new, w.y_hat);
     residuals<double>(nullptr, w.y_hat, o, w, w.before);
@@ -499,6 +501,30 @@ inline Code stay(const AnyRun &run, const Step &step) {
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step);
 
+// Return whether the last projection left more of a residual than it would with a gradient that is right: of a gradient from
+// f that holds no longer, as with drag or a wall.
+template <class AnyRun>
+inline bool refutes(const AnyRun &run) {
+    const auto &w = run.work;
+    const FromF known = from_f(run);
+    for (int64_t i = 0; known.pairs > 0 && i < w.l; ++i)
+        if (known.has(i) && !(std::abs(w.residual[i]) <= MOST_MISSED * std::abs(w.before[i]) + MISSED_BANDS * w.band[i]))
+            return true;
+    return false;
+}
+
+// The projection anew with computed gradients, which the run uses from now on.
+[[gnu::cold, gnu::noinline]] inline Code project_without_f(const Run &run, const Step &step) {
+    const Work &w = run.work;
+    w.counters[FROM_F] = 0;
+    fill(w.flow, 0.0, w.l);
+    start_again(run, step);
+    gradients(run, step.t_new, w.y_hat, w.last(), w.G);
+    ++w.counters[NJEV];
+    evaluate_invariants(run, step.t_new, w.y_hat);
+    return project_evaluated(run, step);
+}
+
 // Project w.y_hat into y_new by o.iterations Newton steps; returns OK, FAILED_PROJECTION, POSTPONED or NEAR_SINGULAR.
 //
 // w.err holds the local error of y_hat where the metric wants it, w.last() f there where a gradient does. POSTPONED:
@@ -508,7 +534,7 @@ inline Code project_step(const AnyRun &run, const Step &step) {
     const auto &o = run.options;
     const auto &w = run.work;
     const Known known = std::exchange(run.system.at_raw, Known::NOTHING);
-    if (known != Known::ALL) run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    if (known != Known::ALL) gradients(run, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     note_rates(run, step);
     if (o.every != 1 && (o.metric == BY_ERROR || o.every == AUTO || o.adaptive)) {
@@ -536,6 +562,9 @@ inline Code project_evaluated(const AnyRun &run, const Step &step) {
     if (step.avoids_singular && w.counters[TRIED_INDEPENDENT] < w.counters[INDEPENDENT]) [[unlikely]]
         return NEAR_SINGULAR;
     Code status = correct(run, step, moved.rank);
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (refutes(run)) [[unlikely]]
+            return project_without_f(of_any_length(run), step);
     const bool plain = o.direction == NEW && o.iterations == 1 && !o.compensated;
     const bool again = o.balance_groups.count == 0 && (plain || (!run.method.multistep && origin(step, w)));
     if (status != OK && again && moved.largest_error > 0.0 && all_finite(w.residual, w.l)) [[unlikely]]

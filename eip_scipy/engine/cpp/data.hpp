@@ -25,10 +25,11 @@ constexpr int64_t AUTO = 0;  // the option `every`
 // Indices of the counters, which the step updates and leaves for the next one. From HAVE_ERROR on they are: whether an
 // estimate of the step's error is available; the number of projections begun; the steps since the last projection; how
 // many figures stood out; whether the last row of K holds f at the raw result; and how many gradients of the last
-// accepted projection, and of the last one that was tried, are clearly independent; and the failed projections of steps so
-// short that shorter ones do not help, less the steps without one. HAVE_F may also be OF_STATE, see columns.hpp.
+// accepted projection, and of the last one that was tried, are clearly independent; the failed projections of steps so
+// short that shorter ones do not help, less the steps without one; and whether gradients are made from f, see `FromF` in
+// system.hpp. HAVE_F may also be OF_STATE, see columns.hpp.
 EIP_ENUM(Counter, NFEV, NJEV, NLU, PROJECTIONS, SKIPPED, RANK_REDUCED, REJECTED, LAST_RANK, HAVE_F, HAVE_ERROR, BEGUN,
-         WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, STUCK, N_COUNTERS);
+         WAITED, FOUND, F_AT_RAW, INDEPENDENT, TRIED_INDEPENDENT, STUCK, FROM_F, N_COUNTERS);
 constexpr int64_t OF_STATE = 2;
 // Indices of the clock of a run: the current time, the time at the end of the step tried last and its length, and the
 // length to try next.
@@ -294,6 +295,8 @@ struct Options {
     const double *most_left;          // the share of its terms that a Newton step may leave without a further one
     bool has_limits;                  // whether any of these is finite
     Blocks kinds;                     // floats of the same unit, as far as that is known
+    const double *masses;             // (l, pairs), see `FromF` in system.hpp; pairs = 0 in runs without such gradients
+    int64_t pairs;
     double kappa;
     int64_t metric, direction, iterations, every;
     bool reuse_f, uses_f, compensated, adaptive, watched;
@@ -318,6 +321,7 @@ void fields(Options &o, Visit &visit) {
     visit("computed", o.computed, is.l);
     visit("most_left", o.most_left, is.l);
     visit.record("kinds", "Grouping", o.kinds);
+    visit("masses", o.masses, is.l, Bound{o.pairs});
     each(visit, "kappa", o.kappa, "metric", o.metric, "direction", o.direction, "iterations", o.iterations, "every",
          o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
          "per_band", o.per_band, "watched", o.watched, "limit", o.limit, "distant", o.distant);

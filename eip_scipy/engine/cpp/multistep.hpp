@@ -503,7 +503,7 @@ inline void newest_state(const AnyRun &run, double t) {
     const auto &w = run.work;
     state_of(ms, 0, as_floats(w.y_hat), as_floats(w.carry_hat));
     slope_of(ms, 0, as_floats(w.y_hat), as_floats(w.last()));
-    run.system.grad(w, t, w.y_hat, w.last(), w.G);
+    gradients(run, t, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
 }
 
@@ -517,7 +517,7 @@ inline void residuals_in_the_middle(const AnyRun &run, double t, Value *scratch)
     const double before = ms.t0 + static_cast<double>(ms.place[NEWEST] - ms.middle) * ms.h;
     state_of(ms, ms.middle, as_floats(scratch), as_floats(w.carry));
     slope_of(ms, ms.middle, as_floats(scratch), as_floats(w.f_point));
-    run.system.grad(w, before, scratch, w.f_point, w.Q);
+    gradients(run, before, scratch, w.f_point, w.Q);
     ++w.counters[NJEV];
     evaluate_carried(run, before, scratch, w.carry, w.Q);
     residuals_of_values(ms, w);
@@ -633,7 +633,7 @@ inline Code project_last(const Run &run, const Step &step, double from) {
         gather_errors(size, static_cast<double>(ms.place[SINCE]), w);
     }
     if (w.l == 0) return OK;
-    run.system.grad(w, step.t_new, w.y_hat, w.last(), w.G);
+    gradients(run, step.t_new, w.y_hat, w.last(), w.G);
     w.counters[F_AT_RAW] = 1;
     note_rates(run, step);
     evaluate_invariants(run, step.t_new, w.y_hat);

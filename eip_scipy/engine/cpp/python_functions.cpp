@@ -173,6 +173,15 @@ void PythonFunctions::all(Functions kind, double t, const double *y, const doubl
     }
 }
 
+void PythonFunctions::gradients(double t, const double *y, const double *f, double *G, const FromF &known) {
+    int64_t i = 0;
+    for (const auto &call : calls_[GRADIENTS]) {
+        if (!known.has(i)) (*call)(t, y, f, G, owner_);
+        G += call->floats();
+        i += call->floats() / m_;
+    }
+}
+
 void PythonFunctions::one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) {
     (*calls_[kind][k])(t, y, f, out, owner_);
 }

@@ -50,6 +50,7 @@ class PythonFunctions final : public CalledFunctions {
     void rhs(double t, const double *y, double *out) override;
     void jacobian(double t, const double *q, const double *dq, double *out) override;
     void all(Functions kind, double t, const double *y, const double *f, double *out) override;
+    void gradients(double t, const double *y, const double *f, double *G, const FromF &known) override;
     void one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) override;
     bool has_jacobian() const { return jacobian_.has_value(); }
     int64_t events() const { return std::ssize(calls_[EVENTS]); }

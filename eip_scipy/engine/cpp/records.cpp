@@ -273,6 +273,8 @@ Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept) 
     require(o.frame.groups == 0 || (o.frame.count >= 1 && 3 * o.frame.groups * o.frame.count == w.m),
             "engine: the frame's bodies do not fit the state");
     require(o.every >= 0, "engine: every must not be negative");
+    require(o.pairs == 0 || (2 * o.pairs == w.m && w.n == w.m && o.balances.count == 0 && o.columns.count == 0),
+            "engine: gradients from f need a real state (q, v) without balances and columns");
     check_balances(o.balances, w);
     check_groups(o.balance_groups, w);
     check_columns(o.columns, w);
@@ -502,7 +504,7 @@ OctetSystem octet_system_of(nb::handle functions, const Data &run) {
     const Multistep *ms = run.method.multistep;
     const bool steps =
         ms ? !ms->brief && !ms->level && (ms->count == 0 || !jacobian.is_none()) : !o.compensated && o.every >= 1;
-    require(!run.system.python && w.n == w.m && !o.adaptive && o.iterations == 1 && o.direction == NEW && steps,
+    require(!run.system.python && w.n == w.m && o.pairs == 0 && !o.adaptive && o.iterations == 1 && o.direction == NEW && steps,
             "engine: members with these options cannot be run in batches of eight");
     return system;
 }

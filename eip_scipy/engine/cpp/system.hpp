@@ -19,6 +19,24 @@ struct Broken {};
 using ValuePointer = int (*)(double t, const double *y, double *out, const double *params);
 using GradientPointer = int (*)(double t, const double *y, const double *f, double *G, const double *params);
 
+// Gradients that are made from the derivative f = (v, a) of a state of 2 `pairs` floats instead of being computed: the
+// gradient of value i of the invariants is (-M a, M v), with M = masses[i * pairs ...], or is not one of them if M is NaN.
+struct FromF {
+    const double *masses = nullptr;
+    int64_t pairs = 0;
+
+    bool has(int64_t i) const { return pairs > 0 && !std::isnan(masses[i * pairs]); }
+
+    // Fills the row G of value i.
+    void fill_row(int64_t i, const double *f, double *G) const {
+        for (int64_t k = 0; k < pairs; ++k) {
+            const double mass = masses[i * pairs + k];
+            G[k] = -mass * f[pairs + k];
+            G[pairs + k] = mass * f[k];
+        }
+    }
+};
+
 // Functions in Python, of these kinds; of a balance without a rate of its own there is none of the last one.
 enum Functions { VALUES, GRADIENTS, EVENTS, RATES, N_FUNCTIONS };
 class CalledFunctions {
@@ -26,8 +44,9 @@ class CalledFunctions {
     virtual ~CalledFunctions() = default;
     virtual void rhs(double t, const double *y, double *out) = 0;
     virtual void jacobian(double t, const double *q, const double *dq, double *out) = 0;
-    // All functions of a kind, and one of them.
+    // All functions of a kind; the gradients but those that are known; and one function.
     virtual void all(Functions kind, double t, const double *y, const double *f, double *out) = 0;
+    virtual void gradients(double t, const double *y, const double *f, double *G, const FromF &known) = 0;
     virtual void one(Functions kind, int64_t k, double t, const double *y, const double *f, double *out) = 0;
 };
 
@@ -198,6 +217,17 @@ struct System {
         each_gradient(w, t, y, f, G);
     }
 
+    // The gradients of a run whose states have no columns, of which some are made from f.
+    template <class W>
+    [[gnu::noinline]] void grad(const W &w, double t, const double *y, const double *f, double *G, const FromF &known) {
+        if (by_pointer)
+            each_gradient(w, t, y, f, G, known);
+        else
+            python->gradients(t, y, f, G, known);
+        for (int64_t i = 0; i < w.l; ++i)
+            if (known.has(i)) known.fill_row(i, f, G + i * w.m);
+    }
+
     // The rates of all balances, where f is the derivative at y.
     template <class W>
     [[gnu::noinline]] void rates(const W &w, double t, const double *y, const double *f, double *out) {
@@ -343,10 +373,12 @@ struct System {
     }
 
     template <class W>
-    [[gnu::always_inline]] void each_gradient(const W &w, double t, const double *y, const double *f, double *G) {
-        for (int64_t k = 0; k < std::ssize(grad_pointers); ++k) {
-            grad_by_pointer(w, k, t, y, f, G);
+    [[gnu::always_inline]] void each_gradient(const W &w, double t, const double *y, const double *f, double *G,
+                                              const FromF &known = {}) {
+        for (int64_t k = 0, i = 0; k < std::ssize(grad_pointers); ++k) {
+            if (!known.has(i)) grad_by_pointer(w, k, t, y, f, G);
             G += grad_pointers[k].floats;
+            if (known.pairs > 0) i += grad_pointers[k].floats / w.m;
         }
     }
 
@@ -460,6 +492,25 @@ inline void evaluate_f(const AnyRun &run, double t, const double *y, double *f) 
     ++run.work.counters[NFEV];
 }
 
+// True if a run is one of a single state: batches of members have no balances, and no gradients from f.
+template <class AnyRun>
+constexpr bool IS_SINGLE = std::remove_cvref_t<decltype(std::declval<AnyRun>().system)>::MEMBERS == 1;
+
+// What the run's gradients are made from at present; empty after a projection that has refuted it.
+template <class AnyRun>
+inline FromF from_f(const AnyRun &run) {
+    if (run.options.pairs == 0 || !run.work.counters[FROM_F]) return {};
+    return {run.options.masses, run.options.pairs};
+}
+
+// The gradients at y, where the derivative is f.
+template <class AnyRun, class Value>
+inline void gradients(const AnyRun &run, double t, const Value *y, const Value *f, Value *G) {
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (const FromF known = from_f(run); known.pairs > 0) return run.system.grad(run.work, t, y, f, G, known);
+    run.system.grad(run.work, t, y, f, G);
+}
+
 // Uses the code for states of any length.
 template <class W, class Called>
 inline RunOf<Work, Called> of_any_length(const RunOf<W, Called> &run) {
@@ -488,7 +539,7 @@ struct PlainOptions : Options {
     static constexpr Balances balances{};
     static constexpr Groups balance_groups{};
     static constexpr Columns columns{};
-    static constexpr int64_t direction = NEW, iterations = 1, every = 1;
+    static constexpr int64_t direction = NEW, iterations = 1, every = 1, pairs = 0;
     static constexpr bool has_limits = false, compensated = false, adaptive = false;
 };
 struct PlainMethod : Method {
@@ -499,7 +550,7 @@ struct PlainMethod : Method {
 
 inline bool is_plain(const Method &m, const Options &o) {
     const bool whole =
-        o.frame.rows == 0 && o.balances.count == 0 && o.balance_groups.count == 0 && o.columns.count == 0;
+        o.frame.rows == 0 && o.balances.count == 0 && o.balance_groups.count == 0 && o.columns.count == 0 && o.pairs == 0;
     const bool once = o.direction == NEW && o.iterations == 1 && o.every == 1 && !o.has_limits;
     return whole && once && !o.compensated && !o.adaptive && !m.nystrom && !m.paired && !m.multistep;
 }
@@ -512,10 +563,6 @@ struct Plain : SizedWith<M, L> {
     explicit Plain(const Work &w) : SizedWith<M, L>(w) {}
     static constexpr int64_t balances = 0;
 };
-
-// True if a run is one of a single state: batches of members have no balances.
-template <class AnyRun>
-constexpr bool IS_SINGLE = std::remove_cvref_t<decltype(std::declval<AnyRun>().system)>::MEMBERS == 1;
 
 // One try of a step from (t, y).
 struct Step {

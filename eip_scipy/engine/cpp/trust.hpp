@@ -14,6 +14,8 @@ constexpr double STILL = 1e4 * EPS;
 // LEAST_BALANCE_RATE on, because a wrong rate of a slow balance shows no more, and again when it has grown by RATE_GROWTH.
 // Terms that vanish for a moment, as those of velocity constraints do at singular positions, count as LEAST_TERMS of the
 // largest so far.
+// Part of a step over which differences of values along the flow are taken.
+constexpr double PART_OF_STEP = 1.0 / 64.0;
 constexpr double LARGEST = std::numeric_limits<double>::max();
 constexpr double LEAST_RATE = 1e-8, LEAST_BALANCE_RATE = 1e-10, RATE_GROWTH = 2.0, LEAST_TERMS = 0.1;
 // A local error is suspicious from this share of what the step changes in its block, or of the block's size, on, and again
@@ -236,11 +238,28 @@ inline void note_slowness(double rate, double terms, int64_t b, const Work &w) {
     }
 }
 
+// What the invariants whose gradients are made from f change by along the flow, into w.flow with the other sign: differences of
+// their values. The product of such a gradient with f tells nothing: it is 0 in each state.
+[[gnu::cold, gnu::noinline]] inline void note_values_along_flow(const Run &run, const Step &step, const FromF &known) {
+    const Work &w = run.work;
+    const double part = PART_OF_STEP * step.h;
+    double *state = w.stage, *values = w.inner_mu;
+    fill(w.flow, 0.0, w.l);
+    for (const auto &[shifts, weight] : {std::pair{1.0, 2.0 / 3.0}, {-1.0, -2.0 / 3.0}, {2.0, -1.0 / 12.0}, {-2.0, 1.0 / 12.0}}) {
+        for (int64_t j = 0; j < w.m; ++j) state[j] = w.y_hat[j] + shifts * part * w.last()[j];
+        run.system.inv(w, step.t_new, state, values);
+        for (int64_t i = 0; i < w.l; ++i)
+            if (known.has(i)) w.flow[i] -= weight / part * values[i];
+    }
+}
+
 // Note the rates where f at y_hat is known.
 template <class AnyRun>
 [[gnu::noinline]] inline void note_known_rates(const AnyRun &run, const Step &step) {
     const auto &w = run.work;
     if (w.balances > 0) note_balances(of_any_length(run), step);
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (const FromF known = from_f(run); known.pairs > 0) note_values_along_flow(of_any_length(run), step, known);
     if (!rates_stand_out(w, w.balances > 0 ? LEAST_BALANCE_RATE : LEAST_RATE)) return;
     for (int64_t i = 0; i < w.l; ++i) w.figures(i)[RATE_NOTED] = w.figures(i)[RATE];
     suspect(CHANGES_ALONG_FLOW, step, w);
