@@ -34,8 +34,8 @@ NULL_RATE = 1e-9
 # Coefficients below this share of the largest one are 0; pivots are larger than LEAST_PIVOT. Others are rounded to BITS
 # bits, so that they do not depend on the points. A rate may differ from 0 by HOLDS times the sum of its terms.
 NEGLIGIBLE, LEAST_PIVOT, BITS, HOLDS = 1e-9, 1e-4, 32, 1e-8
-# Gradients of states of more components are made of the components of f where they can be: up to two passes of dual numbers
-# take no more time than f.
+# Compiled gradients of states with more components are made of f where they can be: for fewer, dual numbers take little
+# more time than f.
 FEW = 24
 # A vector is a combination of others if its remainder is below this share of it.
 REMAINDER = 1e-7
@@ -113,8 +113,10 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
         and not (n > MOST_COMPONENTS and invariants.by_values.any())  # gradients by differences take long
         and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
     )  # fmt: skip
-    is_pair = n > FEW and n % 2 == 0 and not run.tangents.count and not method.in_python
-    rows = np.flatnonzero(invariants.computed) if is_pair else ()
+    rows: Array = np.zeros(0, int)
+    if n % 2 == 0 and not (run.tangents.count or method.in_python):
+        alone = invariants.of_values(np.diff(invariants.starts) == 1)  # an item is evaluated as a whole
+        rows = np.flatnonzero(alone & (invariants.computed if n > FEW else invariants.by_numbers))
     if not (is_searched or known or names or len(rows)):
         return NOTHING
     samples = _Samples(run, y, f, is_searched)
@@ -131,7 +133,7 @@ def _masses_from_f(samples: _Samples, rows: Array) -> Array | None:
     For q'' = a(t, q) and H = T + V, and for canonical (q, p), the gradient of the energy has the components of f, up to
     constant factors M. They are found and compared at the start and at the first points.
     """
-    y, f, G = map(np.array, zip(*samples.states(), strict=True))
+    _, f, G = map(np.array, zip(*samples.states(), strict=True))
     v, a = np.split(f, 2, axis=1)
     masses = np.full((G.shape[1], v.shape[1]), np.nan)
     for k in rows:

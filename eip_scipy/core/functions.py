@@ -22,7 +22,6 @@ from ..engine.native import Call, LibraryFunction, NativeFunctions, Rates
 from .inputs import as_vector, filled, is_number, real_array, reals, shown
 
 if TYPE_CHECKING:
-    from .invariant_set import InvariantSet
     from .numba_bridge import Compiled
     from .runs import Run
 
@@ -372,7 +371,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     name, size = ("acceleration", n // 2) if second_order else ("fun", n)
     add("rhs", fun, name, (size,), size, in_place=form.endswith("place"))
     for k in range(len(invariants.items)):
-        _add_invariant(add, invariants, k, n)
+        _add_invariant(add, run, k, n)
     for k, item in invariants.balances.items.items():
         name, takes_f = f"rate of balance {invariants.labels[k]!r}", item.rate_uses_f
         add("rate", item.rate_function, name, invariants.shapes[k], n, real=True, takes_f=takes_f, gradient=True)
@@ -402,8 +401,10 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     ), reason
 
 
-def _add_invariant(add: Callable[..., None], invariants: InvariantSet, k: int, n: int) -> None:
+def _add_invariant(add: Callable[..., None], run: Run, k: int, n: int) -> None:
     """Add invariant k of a run: its value, its gradient, and derivatives by parameters of an augmented state."""
+    invariants = run.invariants
+    from_f = invariants.starts[k] in run.conserved.rows_from_f  # the engine takes differences where f does not serve
     item, label, shape = invariants.items[k], invariants.labels[k], invariants.shapes[k]
     name, alone = f"invariant {label!r}", item.unaugmented
     if alone is not None:
@@ -411,7 +412,7 @@ def _add_invariant(add: Callable[..., None], invariants: InvariantSet, k: int, n
     if item.args:
         raise NotCompilableError(f"{name} has args; pass its parameters through params")
     add("inv", item.function, name, shape, n, real=True)
-    if item.gradient is None and not isinstance(item.function, PointerFunction):
+    if item.gradient is None and not (from_f or isinstance(item.function, PointerFunction)):
         raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
     form = {"takes_f": item.uses_f, "in_place": item.in_place, "gradient": True}
     add("grad", item.gradient, f"gradient of {name}", (*shape, n), n, **form)

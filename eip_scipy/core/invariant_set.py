@@ -179,8 +179,8 @@ class InvariantSet:
     """All invariants of a run together: sizes, names, targets, scales, and the functions that the step calls.
 
     The start is the time, the state, the derivative and the length of a step. The values and their shapes are checked
-    there. `extra` are the run's further arguments. Invariants are evaluated only at times from t0 to `t_bound`, by default only at t0. `rhs` is
-    the right-hand side of the system, for checks.
+    there. `extra` are the run's further arguments. Invariants are evaluated only at times from t0 to `t_bound`, by
+    default only at t0. `rhs` is the right-hand side of the system, for checks.
 
     Item k has the values with the indices from `starts[k]` to `starts[k + 1]`, of the shape `shapes[k]`. The `target`
     of `balances` are the values that the run integrates. `kinds` are groups of components that have the same unit, or
@@ -272,6 +272,11 @@ class InvariantSet:
     def floors(self) -> Array:
         """Return the `typical_sizes` (n,) of the components at the start, units that do not vanish with a component."""
         return typical_sizes(*self._start)
+
+    @property
+    def by_numbers(self) -> Array:
+        """Return a mask of the values whose gradients come from complex steps or differences."""
+        return self.of_values([isinstance(grad, NumericalGradient) for grad in self.grads])
 
     @property
     def by_values(self) -> Array:

@@ -53,7 +53,9 @@ class Diagnostics:
         of their own, because f has their components, and whether a projection has refuted this since.
         """
         until = "" if self._counters[data.FROM_F] else "; a projection has refuted this, and it is computed since then"
-        return self._remarks + ((f"the gradient of {self._from_f} is made of the components of f{until}",) * bool(self._from_f))
+        return self._remarks + (
+            (f"the gradient of {self._from_f} is made of the components of f{until}",) * bool(self._from_f)
+        )
 
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""

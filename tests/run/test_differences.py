@@ -155,21 +155,29 @@ def chain_energy(t, y):
     return total
 
 
+def squares(t, y):
+    return np.sum(y**2)
+
+
 def pulse(m):
     return np.concatenate([np.exp(-(np.linspace(-4, 4, m) ** 2)), np.zeros(m)])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [False, True])
-def test_gradients_of_a_large_grid_by_its_values_are_told(compiled):
-    """The warning appears once, with a correct line of code that fixes it; a small state is not reported."""
+def test_gradients_of_a_large_grid_are_made_of_f_or_their_cost_is_told(compiled):
+    """An energy needs no evaluation of its gradient; for a mass the warning appears once, with what to write."""
     m = LARGE // 2
-    fun, energy = (njit(chain), njit(chain_energy)) if compiled else (chain, chain_energy)
-    told = pytest.warns(UserWarning, match=rf"no grad is given for 'H': .* {2 * m} evaluations .* w \* np.concatenate")
-    with told as found:
-        run = integrate(fun, (0, 0.1), pulse(m), method=EIPRK4, h=0.05, invariants=Invariant(energy, name="H"))
-    assert len(found) == 1
+    fun, energy, mass = (njit(g) if compiled else g for g in (chain, chain_energy, squares))
+    options = {"method": EIPRK4, "h": 0.05}
+    run = integrate(fun, (0, 0.1), pulse(m), invariants=Invariant(energy, name="H"), **options)
     assert run.compiled == compiled
+    assert "the gradient of 'H' is made of the components of f" in run.diagnostics.remarks
+    told = pytest.warns(UserWarning, match=rf"no grad is given for 'B': .* {2 * m} evaluations .* 2 \* w \* y")
+    with told as found:
+        other = integrate(fun, (0, 0.1), pulse(m), invariants=Invariant(mass, name="B"), check=False, **options)
+    assert len(found) == 1
+    assert other.compiled == compiled
     mended = Invariant(chain_energy, lambda t, y, f: np.concatenate([-f[m:], f[:m]]), uses_f=True, name="H")
     other = integrate(chain, (0, 0.1), pulse(m), method=EIPRK4, h=0.05, invariants=mended)
     np.testing.assert_allclose(run.y, other.y, rtol=0, atol=1e-13)

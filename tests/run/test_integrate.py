@@ -329,9 +329,11 @@ def test_compensation_in_five_thousand_steps(h):
 
 
 def same_as_by_gradient(value, y0, **options):
-    """The run without grad agrees with the one that has it."""
-    options = {"fun": pendulum, "y0": y0, "h": 0.1, "metric": "euclidean", **options}
-    by_hand = run((0, 20), invariants=Invariant(pendulum_energy, pendulum_gradient), **options)
+    """The run without grad agrees with the one that has it; a third component keeps it from being made of f."""
+    options = {"fun": lambda t, y: np.append(pendulum(t, y[:2]), 0.0), "y0": [*y0, 0.0], "h": 0.1, **options}
+    options["metric"] = "euclidean"
+    gradient = lambda t, y: np.append(pendulum_gradient(t, y), 0.0)  # noqa: E731
+    by_hand = run((0, 20), invariants=Invariant(pendulum_energy, gradient), **options)
     computed = run((0, 20), invariants=Invariant(value, name="H"), **options)
     assert computed.status == 0
     assert (computed.max_residual <= 1e-14).all()
