@@ -318,6 +318,35 @@ def _define_flat(function: Any) -> None:
     _overload(function)(typed)
 
 
+def _define_flat_for_arrays(function: Any) -> None:
+    """Define such a function with values of floats for an array of duals."""
+
+    def typed(x):
+        if not (_is_array(x, 1, 2) and isinstance(x.dtype, Dual)):
+            return None
+
+        def of_array(x):
+            out = np.empty(x.shape)
+            for place in np.ndindex(x.shape):
+                out[place] = function(value_of(x[place]))
+            return out
+
+        return of_array
+
+    _overload(function)(typed)
+
+
+def _define_rounding(function: Any) -> None:
+    """Define a function that rounds a number, or the numbers of an array, to a number of decimals if it is given."""
+    _define_flat(function)
+    _define_flat_for_arrays(function)
+
+    def typed(x, decimals):
+        return (lambda x, decimals: function(value_of(x), decimals)) if isinstance(x, Dual) else None
+
+    _overload(function)(typed)
+
+
 @_inner
 def _slope_of_power(a, b, v):
     if b == 0.0:
@@ -367,10 +396,9 @@ _define_binary(math.copysign, lambda a, b, v: math.copysign(1.0, a) * math.copys
 _define_binary(max, lambda a, b, v: 1.0 if a >= b else 0.0, lambda a, b, v: 1.0 if a < b else 0.0, np.maximum, np.fmax)
 _define_binary(min, lambda a, b, v: 1.0 if a <= b else 0.0, lambda a, b, v: 1.0 if a > b else 0.0, np.minimum, np.fmin)
 
-FLAT: tuple[Any, ...] = (
-    math.floor, math.ceil, math.isnan, math.isinf, math.isfinite, np.sign, np.isnan, np.isfinite, np.floor, np.ceil,
-)  # fmt: skip
-for _function in FLAT:
+FLAT: tuple[Any, ...] = (math.floor, math.ceil, math.trunc, math.isnan, math.isinf, math.isfinite, int)
+FLAT_FOR_ARRAYS: tuple[Any, ...] = (np.sign, np.isnan, np.isfinite, np.floor, np.ceil, np.trunc, np.rint)
+for _function in FLAT + FLAT_FOR_ARRAYS:
     _define_flat(_function)
 
 
@@ -405,6 +433,12 @@ for _function in (operator.pow, operator.ipow, math.pow, np.power):
 
 def _is_array(kind: Any, *ndims: int) -> bool:
     return isinstance(kind, types.Array) and kind.ndim in ndims and isinstance(kind.dtype, Dual | PLAIN)
+
+
+for _function in FLAT_FOR_ARRAYS:
+    _define_flat_for_arrays(_function)
+for _function in (round, np.round, np.around):
+    _define_rounding(_function)
 
 
 def _define_for_arrays(function: Any) -> None:

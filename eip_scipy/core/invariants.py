@@ -47,10 +47,10 @@ class Invariant:
     grad : callable, optional
         ``grad(t, y, *args) -> (n,) or (l_i, n)``. For complex y, dI = Re sum_k conj(g_k) dy_k. Default: the gradient
         is made of the components of f where f has them (an energy of q'' = a(t, q), or of (q, p); for compiled
-        functions from 26 components on), or else computed. If `fun` is jitted by Numba, y is real and there are no `args`, dual numbers give a compiled
-        gradient, exact to rounding. The gradient of a C function comes from central differences of order 6, in the
-        engine. For any other function it comes from a complex step if `fun` allows one, otherwise from such
-        differences (with a warning; not compiled). A complex step takes n + 1 evaluations of `fun`, differences take
+        functions from 26 components on), or else computed. If `fun` is jitted by Numba, y is real and there are no
+        `args`, dual numbers give a compiled gradient, exact to rounding. The gradient of a C function comes from
+        central differences of order 6, in the engine. For any other function it comes from a complex step if `fun`
+        allows one, otherwise from such differences (with a warning; not compiled). A complex step takes n + 1 evaluations of `fun`, differences take
         6 n and more. If a complex step is wrong for some states only, as for a norm or an absolute value, differences
         replace it at these states.
     target : float or array_like, shape (l_i,), optional

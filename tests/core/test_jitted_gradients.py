@@ -98,7 +98,17 @@ def arrays_and_a_number_that_varies(t, y):
     return (two[0] + three[1] + one[1] - one[0]) ** 2
 
 
+@case(
+    lambda a, b, c, d: (a - 0.6) ** 2 * b + (c - 4) ** 3 + b * mpmath.mpf(1.3)
+    + (a - 0.5) ** 2 + (b + 0.5) ** 2 + (c - 1.5) ** 2 + d**2
+)  # fmt: skip
+def nearest_images(t, y):
+    one = (y[0] - 0.3 * round(y[0] / 0.3)) ** 2 * y[1] + (y[2] - np.rint(3 * y[2])) ** 3 + np.around(y[2], 1) * y[1]
+    return one + y[3] * (int(4 * y[0]) + np.trunc(7 * y[1])) + np.sum((y - 0.5 * np.round(y / 0.5)) ** 2)
+
+
 GATE = {
+    "nearest_images",
     "arrays_and_a_number_that_varies",
     "kepler_by_arrays",
     "exponentials",
