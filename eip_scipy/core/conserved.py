@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dgeqp3
 
 from ..engine.native import LibraryFunction
 from ..methods.base import PROJECTION_ONLY
-from .gradients import time_of_motion, typical_sizes, unless_error
+from .derivatives import time_of_motion, typical_sizes, unless_error
 from .particles import LinearInvariants, particle_invariants
 
 if TYPE_CHECKING:

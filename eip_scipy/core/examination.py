@@ -18,7 +18,7 @@ from ..engine import data
 from ..engine.data import LEAST_CHANGE, Grouping, Method
 from ..engine.native import BUILD
 from ..methods.runge_kutta import DOP853, RK4
-from .gradients import random_directions, unless_error
+from .derivatives import random_directions, unless_error
 from .invariant_checks import findings
 from .invariant_set import InvariantSet
 

@@ -17,7 +17,7 @@ from ..engine import data
 from ..engine.data import EPS
 from ..engine.trust import ROUNDING_OF_DIFFERENCES, ProjectionWarning
 from .callers import users_level
-from .gradients import DIFFERENCE_WEIGHTS, random_directions, time_of_motion
+from .derivatives import DIFFERENCE_WEIGHTS, random_directions, time_of_motion
 from .inputs import converted_from_single
 
 if TYPE_CHECKING:

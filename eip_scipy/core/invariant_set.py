@@ -16,13 +16,13 @@ import numpy as np
 from ..engine.data import EPS, Grouping
 from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
 from .callers import users_level
-from .functions import NotCompilableError, PointerFunction, is_jitted, jit_is_off, names, scalars
-from .gradients import NumericalGradient, difference_gradient, typical_sizes, unless_error
+from .derivatives import NumericalGradient, difference_gradient, typical_sizes, unless_error, with_duals
+from .functions import NotCompilableError, PointerFunction, names
 from .inputs import filled, numbers, require_arguments, shown, states
 from .invariant_checks import findings, listed, reported, time_derivative
 from .invariants import Invariant, as_invariants, copied
 
-__all__ = ["BalanceSet", "InvariantSet", "check_gradient", "with_duals"]
+__all__ = ["BalanceSet", "InvariantSet", "check_gradient"]
 
 Array = np.ndarray
 FLOAT = np.dtype(float)
@@ -112,25 +112,6 @@ def _require_arguments(fun: Any, what: str, first: tuple[str, ...], args: tuple,
     last = f"the {names(extra)[0].partition('[')[0]} of the run" if extra else "those of the call"
     advice = f"It must accept {', '.join(first)}, then its own arguments, Invariant(..., args=(...,)), then {last}."
     require_arguments(fun, given, what, advice)
-
-
-def with_duals(item: Any, kind: str, n: int, shape: tuple[int, ...], extra: tuple) -> Any:
-    """Return an invariant with a compiled "gradient" or "rate", the `kind`; itself if it is not jitted, or has args.
-
-    The state is real and has n components. Raise NotCompilableError if dual numbers cannot do what the invariant does.
-    """
-    types = scalars(extra)
-    if item.args or types is None or not is_jitted(item.function) or jit_is_off():
-        return item
-    from . import jitted_gradients  # which loads Numba
-
-    made = getattr(jitted_gradients, f"{kind}_by_duals")(item.function, n, shape, bool(extra), types)
-    item = copied(item)
-    if kind == "gradient":
-        item.gradient, item.in_place = made, True
-    else:
-        item.rate_function, item.rate_uses_f = made, True
-    return item
 
 
 class BalanceSet:

@@ -50,9 +50,9 @@ class Invariant:
         functions from 26 components on), or else computed. If `fun` is jitted by Numba, y is real and there are no
         `args`, dual numbers give a compiled gradient, exact to rounding. The gradient of a C function comes from
         central differences of order 6, in the engine. For any other function it comes from a complex step if `fun`
-        allows one, otherwise from such differences (with a warning; not compiled). A complex step takes n + 1 evaluations of `fun`, differences take
-        6 n and more. If a complex step is wrong for some states only, as for a norm or an absolute value, differences
-        replace it at these states.
+        allows one, otherwise from such differences (with a warning; not compiled). A complex step takes n + 1
+        evaluations of `fun`, differences take 6 n and more. If a complex step is wrong for some states only, as for a
+        norm or an absolute value, differences replace it at these states.
     target : float or array_like, shape (l_i,), optional
         The value to keep. Default: the value at the start. If a target is given, the start must meet it to 1e-8 of the
         largest of ``|I|``, ``|target|``, ``sum_k |G_k y_k|`` (G is the gradient) and `scale`. Steps meet it to 1e-9,

@@ -12,16 +12,13 @@ import numpy as np
 from llvmlite import ir
 from numba import from_dtype, njit, types
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.errors import NumbaError, TypingError
-from numba.core.typing.templates import AttributeTemplate, infer_getattr
+from numba.core.errors import NumbaError
 from numba.np.arrayobj import populate_array
 
 from ..engine.native import LibraryFunction
 from .functions import ChangedShapeError, Kind, NotCompilableError
 
-__all__ = ["Compiled", "compiled", "compiled_or_none", "jitted_call", "refuse_addresses"]
-
-MOST_DIMENSIONS = 4  # of arrays whose addresses are refused
+__all__ = ["Compiled", "compiled", "compiled_or_none", "jitted_call"]
 
 # Counter for the names of C functions.
 _serial = count()
@@ -167,23 +164,6 @@ def compiled_or_none(fun: Any, kind: Kind) -> Compiled | None:
         return compiled(fun, kind, fun.__name__)
     except NotCompilableError:
         return None
-
-
-def refuse_addresses(kind: Any, name: str) -> None:
-    """Make the use of ``array.ctypes`` an error in functions compiled for arrays of the Numba type `kind`.
-
-    C code would read the memory of such an array as floats. `name` describes the numbers in the error.
-    """
-    for ndim in range(1, MOST_DIMENSIONS + 1):
-        addresses = types.ArrayCTypes(types.Array(kind, ndim, "C"))  # Numba has one object for all layouts
-        addresses.can_convert_to = lambda context, other: None
-
-        @infer_getattr
-        class _Refusal(AttributeTemplate):  # a template for one type replaces those for its class
-            key = addresses
-
-            def generic_resolve(self, kind: Any, attribute: str) -> None:
-                raise TypingError(f"Cannot give C code the address of an array of {name}")
 
 
 @cache

@@ -12,7 +12,7 @@ import numpy as np
 from ..engine.data import EPS, Span
 from ..methods.base import Method
 from .callers import users_level
-from .gradients import time_of_motion
+from .derivatives import time_of_motion
 from .inputs import is_number, reals, shown
 
 __all__ = ["ATOL", "UNBOUNDED", "StepControl", "fixed_steps", "interval", "saved_steps"]

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from ..checkpoint import require_place
 from ..core.conserved import NEAR_DISTANCE, confirmed
+from ..core.derivatives import unless_error
 from ..core.events import Events
 from ..core.functions import PointerFunction, extra_arguments, floats, is_compiled, parameter_values
-from ..core.gradients import unless_error
 from ..core.inputs import count, flag, shown, states
 from ..core.invariants import as_invariants
 from ..core.names import nearest

@@ -23,7 +23,7 @@ from numba.core.typeconv import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import lower_builtin, lower_cast, models, register_model
 
-from ..core.numba_bridge import refuse_addresses
+from ..numba_duals import refuse_addresses
 
 __all__ = ["LANES8"]
 

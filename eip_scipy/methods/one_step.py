@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..core.gradients import random_directions, time_of_motion, unless_error
+from ..core.derivatives import random_directions, time_of_motion, unless_error
 from ..core.inputs import as_vector
 from ..core.projection import is_canonical
 from ..engine.data import EPS, NFEV, Work

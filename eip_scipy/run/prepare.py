@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.bound_problem import FORMS, BoundProblem
+from ..core.derivatives import First
 from ..core.events import Events, as_events, replaced
 from ..core.functions import (
     GRADIENT,
@@ -32,7 +33,7 @@ from ..core.runs import Run
 from ..core.solvers import EIPSolver, class_named, eip_method
 from ..core.step_control import ATOL, StepControl, interval
 from ..core.tangent_vectors import tangent_vectors
-from ..core.variations import First, Variations, augmented_rhs
+from ..core.variations import Variations, augmented_rhs
 from ..engine.data import NFEV, Schedule, Span
 from ..engine.native import LibraryFunction
 from ..methods.base import Method

@@ -10,6 +10,7 @@ import scipy.integrate
 from numpy.typing import ArrayLike
 from scipy.integrate import OdeSolution, OdeSolver
 
+from ..core.derivatives import First
 from ..core.events import Events, as_events, replaced
 from ..core.functions import AccelerationField, are_same
 from ..core.inputs import initial_state, shown
@@ -29,7 +30,7 @@ from ..core.solvers import (
 )  # fmt: skip
 from ..core.step_control import interval
 from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
-from ..core.variations import First, Variations, augmented_rhs
+from ..core.variations import Variations, augmented_rhs
 
 if TYPE_CHECKING:
     Result = dict[str, Any]

@@ -5,7 +5,7 @@ import pytest
 from systems import oscillator
 
 from eip_scipy import Invariant
-from eip_scipy.core.gradients import random_directions
+from eip_scipy.core.derivatives import random_directions
 from eip_scipy.core.invariant_checks import findings
 from eip_scipy.core.invariant_set import InvariantSet
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from eip_scipy import EIPDOP853, ensemble, integrate
-from eip_scipy.core import jitted_tangents
+from eip_scipy import EIPDOP853, ensemble, integrate, numba_duals
 
 pytestmark = [pytest.mark.needs_jit, pytest.mark.slow]
 SPAN, START = (0.0, 3.0), [1.0, 0.3]
@@ -102,7 +101,7 @@ def test_a_component_is_compared_at_its_own_size():
 
 
 def test_wrong_derivatives_of_right_values_are_replaced(monkeypatch):
-    right = jitted_tangents.rhs_by_duals
+    right = numba_duals.pushforward
 
     def wrong(*args):
         def rhs(t, Y, out, *extra):
@@ -111,7 +110,7 @@ def test_wrong_derivatives_of_right_values_are_replaced(monkeypatch):
 
         return rhs
 
-    monkeypatch.setattr(jitted_tangents, "rhs_by_duals", wrong)
+    monkeypatch.setattr(numba_duals, "pushforward", wrong)
     run = integrate(pendulum, SPAN, START, variations="state", **OPTIONS)
     assert run.columns["source"] == "complex steps"
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import DOP853
 
-from ...core.gradients import difference_gradient, unless_error
+from ...core.derivatives import difference_gradient, unless_error
 from ...core.inputs import shown
 from ...engine.data import EPS
 from .polynomials import LARGEST_DENOMINATOR, Monomial, Polynomial, Term, product_of

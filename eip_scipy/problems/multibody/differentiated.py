@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.functions import NotCompilableError, compilable, is_jitted, jit_is_off, jitted
-from ...core.gradients import (
+from ...core.derivatives import (
     DIFFER,
     DIFFERENCE_WEIGHTS,
     FIRST_SHIFT,
@@ -26,6 +25,8 @@ from ...core.gradients import (
     NumericalGradient,
     time_of_motion,
 )
+from ...core.derivatives import by_duals as with_duals
+from ...core.functions import NotCompilableError, compilable, is_jitted, jit_is_off, jitted
 from ...engine.data import EPS
 from .motion import new_floats, new_like
 from .parts import Energy, Given, Outputs, Parts, on_copies
@@ -135,16 +136,14 @@ class _Maker:
                     out[i, k] = found[i][k]
 
         if self.compiles:
-            from ...core.jitted_gradients import gradient_by_duals, rate_by_duals
-
-            rate = rate_by_duals(constraints, nq, (m,), False)
+            rate = with_duals("rate", constraints, nq, (m,), False)
 
             def along_by_duals(t, q, dq, out):
                 found = rate(t, q, dq)
                 for i in range(m):
                     out[i] = found[i]
 
-            by_duals = gradient_by_duals(constraints, nq, (m,), False) if given is None else self._made(as_given)
+            by_duals = with_duals("gradient", constraints, nq, (m,), False) if given is None else self._made(as_given)
             return self._made(along_by_duals), by_duals
 
         slopes = self._numerical_slopes()
@@ -368,9 +367,7 @@ class _Maker:
         rate = None if power is None else self._made(lambda t, y: power(t, y[:nq].copy(), y[nq:].copy()))
         described = "u M u / 2 + potential_energy" if energy is None else "energy"
         if self.compiles:
-            from ...core.jitted_gradients import gradient_by_duals
-
-            by_duals = gradient_by_duals(value, nq + n, (), False)
+            by_duals = with_duals("gradient", value, nq + n, (), False)
 
             def gradient(t, y, out):  # Python may call this function, but not what `by_duals` is made of
                 by_duals(t, y, out)

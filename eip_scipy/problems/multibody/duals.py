@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.dual_arrays import inside
-from ...core.dual_numbers import put_slope, seed, slope, value_of
+from ...numba_duals import inside, put_slope, seed, slope, value_of
 from .motion import changed, solve
 
 __all__ = ["by_differences", "solve_duals"]

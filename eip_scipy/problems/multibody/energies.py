@@ -10,8 +10,8 @@ import numpy as np
 
 from ...core.balances import Balance
 from ...core.conserved import reduced_rows
+from ...core.derivatives import difference_gradient
 from ...core.functions import compiled_like
-from ...core.gradients import difference_gradient
 from ...core.invariants import Invariant
 from .motion import plain
 from .parts import Energy, Parts

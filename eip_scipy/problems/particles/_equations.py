@@ -12,8 +12,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
+from ...core.derivatives import DIFFERENCE_WEIGHTS
 from ...core.functions import compiled_like, is_jitted
-from ...core.gradients import DIFFERENCE_WEIGHTS
 
 __all__ = ["FieldFunctions", "ParticleEquations", "compose", "jit_like"]
 

@@ -14,15 +14,17 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
+from numba.core.errors import TypingError
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.extending import is_jitted, overload
 
-from .dual_numbers import Dual
-from .numba_bridge import refuse_addresses
+from .numbers import Dual
 
-__all__ = ["for_duals", "inside"]
+__all__ = ["for_duals", "inside", "refuse_addresses"]
 
 # Options of Numba that a copy takes over, because they change its results or its speed.
 KEPT = ("fastmath", "error_model", "boundscheck", "inline", "forceinline")
+MOST_DIMENSIONS = 4  # of arrays whose addresses are refused
 # Compiles functions that only compiled code calls, because arrays of duals cannot be passed to or from Python.
 inside = partial(njit, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
@@ -79,6 +81,23 @@ def _of_floats(dtype: Any) -> bool:
     if isinstance(dtype, types.NumberClass):
         return isinstance(dtype.dtype, types.Float)
     return not (isinstance(dtype, types.Function) and dtype.typing_key is not float)
+
+
+def refuse_addresses(kind: Any, name: str) -> None:
+    """Make the use of ``array.ctypes`` an error in functions compiled for arrays of the Numba type `kind`.
+
+    C code would read the memory of such an array as floats. `name` describes the numbers in the error.
+    """
+    for ndim in range(1, MOST_DIMENSIONS + 1):
+        addresses = types.ArrayCTypes(types.Array(kind, ndim, "C"))  # Numba has one object for all layouts
+        addresses.can_convert_to = lambda context, other: None
+
+        @infer_getattr
+        class _Refusal(AttributeTemplate):  # a template for one type replaces those for its class
+            key = addresses
+
+            def generic_resolve(self, kind: Any, attribute: str) -> None:
+                raise TypingError(f"Cannot give C code the address of an array of {name}")
 
 
 @cache
