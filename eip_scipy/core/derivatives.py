@@ -10,7 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from ..engine.native import BUILD
 from .functions import (
     GRADIENT,
     NotCompilableError,
+    PointerFunction,
     by_pointer,
     compiled_like,
     is_jitted,
@@ -47,6 +48,8 @@ TRIALS = ((1e-2, 1e-7), (1e-4, 1e-9), (1e-6, 1e-10))
 # Central differences of order 6: weights of +-1, +-2, +-3 steps (Fornberg 1988, table 1); those of order 4, to compare.
 DIFFERENCE_WEIGHTS = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
 LOWER_WEIGHTS = (2 / 3, -1 / 12, 0.0)
+# Largest number of floats of a state for which quadratic forms are looked for, by half the square of it in evaluations.
+MOST_QUADRATIC = 64
 # As in engine/cpp/differences.hpp.
 FIRST_SHIFT, SHORTER, MOST_SHIFTS = 5e-3, 1 / 16, 7
 DIFFER, ROUNDINGS, LEAST = 1e-8, 1e3, np.finfo(float).tiny
@@ -103,8 +106,9 @@ class NumericalGradient:
     """Numerical gradient: by complex steps if they are correct, otherwise by differences of order 6.
 
     A complex step is wrong if the function uses an absolute value, a norm or a real part, perhaps only in a part of its
-    domain. Therefore each gradient by complex steps is compared with a difference along one direction. The choice
-    depends on the state only, so that a resumed run makes the same steps.
+    domain. Therefore each gradient by complex steps is compared with a difference along one direction. So is that of a
+    quadratic form, found at the start, which takes the place of differences. The choice depends on the state only, so
+    that a resumed run makes the same steps. `by_differences` is True if neither is possible.
 
     ``fun(t, y, *args, *extra)`` is the invariant's function, with its own arguments and those of the run;
     `takes_complex` is False if it cannot be called with complex states. `t` and `y` are the start. `floors` (n,) are
@@ -118,6 +122,11 @@ class NumericalGradient:
         self.floors = floors
         self._direction = random_directions(y.size, False)[-1]
         self.complex_step = takes_complex and y.dtype.kind == "f" and self._takes_complex_steps(t, y, extra)
+        self.quadratic: tuple[Array, Array] | None = None
+        if not (self.complex_step or isinstance(fun, PointerFunction) or y.view(float).size > MOST_QUADRATIC):
+            with np.errstate(all="ignore"):
+                self.quadratic = unless_error(self._quadratic_form, t, y, extra)
+        self.by_differences = not self.complex_step and self.quadratic is None
 
     def __call__(self, t: float, y: Array, *extra: Any) -> Array:
         """Return the gradient (n,) at (t, y), or (l_i, n) of an invariant with l_i values."""
@@ -126,7 +135,43 @@ class NumericalGradient:
             found: Array | None = unless_error(BUILD.gradients.checked_complex_step, *where)
             if found is not None:  # it is None if it disagrees with a difference
                 return found
+        if self.quadratic is not None and (found := self._of_form(t, y, extra)) is not None:
+            return found
         return difference_gradient(lambda x: self._fun(t, x, extra), y, self.floors)
+
+    def _units(self, y: Array) -> Array:
+        """Return for each float of y a power of two that has about its size."""
+        return 2.0 ** np.round(np.log2(np.repeat(np.abs(y) + self.floors, y.itemsize // 8)))
+
+    def _quadratic_form(self, t: float, y: Array, extra: tuple) -> tuple[Array, Array] | None:
+        """Return Q and b of values z Q z / 2 + b z + c of the floats z of the state; None if they have another form."""
+        z, units, here = y.view(float), self._units(y), self._fun(t, y, extra)
+
+        def value(shift: Array) -> Array:
+            return self._fun(t, (z + shift).view(y.dtype), extra)
+
+        for way in random_directions(z.size, False) * units:
+            ends = np.array([value(way), here, value(-way), value(2 * way)])
+            third = ends[3] - 3 * ends[0] + 3 * ends[1] - ends[2]
+            if not (np.abs(third) <= ROUNDINGS * EPS * np.abs(ends).max(axis=0)).all():
+                return None
+        shifts = np.diag(units)
+        above, below = (np.array([value(sign * shift) for shift in shifts]) for sign in (1, -1))
+        Q, rounding = np.zeros((z.size, *above.shape)), ROUNDINGS * EPS * np.abs([above, below]).max(axis=(0, 1))
+        for j in range(z.size):
+            Q[j, j] = above[j] - 2 * here + below[j]
+            for k in range(j):
+                Q[j, k] = Q[k, j] = value(shifts[j] + shifts[k]) - above[j] - above[k] + here
+        Q = np.moveaxis(np.where(np.abs(Q) <= rounding, 0.0, Q), (0, 1), (-2, -1)) / np.outer(units, units)
+        return Q, np.moveaxis(above - below, 0, -1) / (2 * units) - Q @ z
+
+    def _of_form(self, t: float, y: Array, extra: tuple) -> Array | None:
+        """Return the gradient of the quadratic form; None if it disagrees with a difference along one direction."""
+        Q, b = cast(tuple[Array, Array], self.quadratic)
+        found, way = Q @ y.view(float) + b, self._units(y) * random_directions(b.shape[-1], False)[-1]
+        above, below = (self._fun(t, y + shift.view(y.dtype), extra) for shift in (way, -way))
+        terms = DIFFER * (np.abs(found) @ np.abs(way)) + ROUNDINGS * EPS * np.maximum(np.abs(above), np.abs(below))
+        return found.view(y.dtype) if (np.abs(above - below - 2 * (found @ way)) <= terms).all() else None
 
     def _fun(self, t: float, y: Array, extra: tuple) -> Array:
         return np.array(self._function(t, y.copy(), *self._args, *extra))  # the function may return the same array

@@ -262,7 +262,7 @@ class InvariantSet:
     @property
     def by_values(self) -> Array:
         """Return a mask (l,) of the values whose gradients come from differences, not from `grad` or a complex step."""
-        return self.of_values([isinstance(g, NumericalGradient) and not g.complex_step for g in self.grads])
+        return self.of_values([isinstance(g, NumericalGradient) and g.by_differences for g in self.grads])
 
     @property
     def by_differences(self) -> list[str]:
@@ -286,7 +286,7 @@ class InvariantSet:
         by_differences = [
             label
             for grad, label in missing
-            if isinstance(grad, NumericalGradient) and not grad.complex_step and label not in self.by_differences
+            if isinstance(grad, NumericalGradient) and grad.by_differences and label not in self.by_differences
         ]
         if by_differences:
             one = len(by_differences) == 1

@@ -1,4 +1,4 @@
-"""Jitted invariants without a gradient get a compiled one: against mpmath, and in runs."""
+"""Gradients that are not given: compiled ones of jitted invariants against mpmath, and in runs; quadratic forms."""
 
 import math
 
@@ -175,7 +175,7 @@ def test_ensembles_run_compiled_with_the_same_bits():
 def test_a_function_that_dual_numbers_cannot_take_runs_interpreted_and_says_so():
     @njit
     def value(t, y):
-        return (y[0] * y[3] - y[1] * y[2]) * math.hypot(1, 0 * y[0]) * np.prod(np.ones(2) + 0 * y[:2])
+        return (y[0] * y[3] - y[1] * y[2]) ** 2 * math.hypot(1, 0 * y[0]) * np.prod(np.ones(2) + 0 * y[:2])
 
     kept = Invariant(value, name="L")
     with pytest.warns(UserWarning, match="'L' has no grad and allows no complex step"):
@@ -197,3 +197,24 @@ def test_a_slow_run_warns_once_that_its_invariant_is_not_jitted(monkeypatch):
     assert len(got) == 1
     run(plain, compiled=False)
     run()
+
+
+# Gradients of functions that are not jitted.
+
+
+def test_a_quadratic_form_that_holds_near_the_start_alone():
+    """Where the function is another one, differences replace its gradient."""
+
+    def value(t, y):
+        r2 = np.vdot(y, y).real
+        return r2 if r2 < 1.6 else r2 + (r2 - 1.6) ** 2
+
+    def slope(t, y):
+        r2 = np.vdot(y, y).real
+        return 2 * y if r2 < 1.6 else 2 * y * (1 + 2 * (r2 - 1.6))
+
+    kept = Invariant(value)
+    y0 = np.array([1.0 + 0j, 0.5])
+    for y in (y0, 1.5 * y0, np.array([0.3j, 2.0])):
+        computed = InvariantSet(kept, 0.0, y0, y0, 1.0).gradients(0.0, y, y)
+        np.testing.assert_allclose(computed[0], slope(0.0, y), rtol=0, atol=1e-9)

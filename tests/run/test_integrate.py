@@ -364,13 +364,36 @@ def test_differences_with_a_warning_where_no_complex_step_is_valid(kind):
             same_as_by_gradient(NOT_ANALYTIC[kind], y0)
 
 
-def test_complex_states_need_differences():
-    kept = Invariant(lambda t, y: np.vdot(y, y).real, name="mass")
+def mass(t, y):
+    return np.vdot(y, y).real
+
+
+def test_complex_states_need_differences_unless_the_invariant_is_a_quadratic_form():
     options = {"fun": lambda t, y: 1j * np.abs(y) ** 2 * y, "y0": np.array([1 + 1j, 0.5]), "h": 0.05}
-    with pytest.warns(UserWarning, match="'mass' has no grad"):
-        computed = run((0, 5), invariants=kept, **options)
-    by_hand = run((0, 5), invariants=Invariant(kept.fun, lambda t, y: 2 * y), check=False, **options)
+    by_hand = run((0, 5), invariants=Invariant(mass, lambda t, y: 2 * y), check=False, **options)
+    computed = run((0, 5), invariants=mass, **options)
+    np.testing.assert_allclose(computed.y[:, -1], by_hand.y[:, -1], rtol=0, atol=1e-12)
+    with pytest.warns(UserWarning, match="'squared' has no grad"):
+        computed = run((0, 5), invariants=Invariant(lambda t, y: mass(t, y) ** 2, name="squared"), **options)
     np.testing.assert_allclose(computed.y[:, -1], by_hand.y[:, -1], rtol=0, atol=1e-10)
+
+
+def test_a_unitary_matrix_without_gradients():
+    """16 invariants: no warning, and hardly more evaluations of them than with gradients."""
+    rng, calls = np.random.default_rng(0), [0]
+    hermitian = (lambda a: a + a.conj().T)(rng.standard_normal((4, 4)) + 1j * rng.standard_normal((4, 4)))
+
+    def products(t, y):
+        calls[0] += 1
+        U = y.reshape(4, 4)
+        P = U.conj().T @ U
+        return np.concatenate([P.real[np.triu_indices(4)], P.imag[np.triu_indices(4, 1)]])
+
+    fun = lambda t, y: -1j * (hermitian @ y.reshape(4, 4)).ravel()  # noqa: E731
+    found = run((0, 5), fun=fun, y0=np.eye(4, dtype=complex).ravel(), invariants=products, h=0.05, t_eval=[1.0, 5.0])
+    U = found.y[:, -1].reshape(4, 4)
+    assert np.abs(U.conj().T @ U - np.eye(4)).max() < 1e-12
+    assert calls[0] < 2000  # differences take 192 for each gradient
 
 
 def test_computed_gradients_take_args_and_params():
