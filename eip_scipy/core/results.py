@@ -33,7 +33,7 @@ class Diagnostics:
         self.max_residual, self._residual, self._max_correction = none, none, np.zeros(1)
         self._counters, self._estimated = np.zeros(data.N_COUNTERS, np.int64), False  # True with an error estimate
         self._trust = Trust((), np.zeros((0, data.N_FIGURES)))
-        self.moved, self._remarks, self._from_f = "", tuple[str, ...](), ""
+        self.moved, self._remarks, self._from_f, self._found_rows = "", tuple[str, ...](), "", None
         self._slow = np.zeros(0, np.int64), np.zeros((data.N_SLOW, 0))  # indices of the balances, and their sums
 
     def _attach(self, **buffers: Any) -> None:
@@ -47,15 +47,18 @@ class Diagnostics:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on linear invariants, gradients that are made of f, and missing invariants of particles.
+        """Sentences on what the run found by itself, and on invariants of particles that are missing.
 
         The number of linear invariants that were found and are kept; the invariants whose gradients need no evaluation
-        of their own, because f has their components, and whether a projection has refuted this since.
+        of their own, because f has their components; and whether the run has refuted this since.
         """
-        until = "" if self._counters[data.FROM_F] else "; a projection has refuted this, and it is computed since then"
-        return self._remarks + (
-            (f"the gradient of {self._from_f} is made of the components of f{until}",) * bool(self._from_f)
-        )
+        found = list(self._remarks)
+        if self._found_rows is not None and not self._found_rows.any():
+            found.append("a linear invariant that was found at the start does not hold later: none is kept since then")
+        if self._from_f:
+            until = "" if self._counters[data.FROM_F] else "; a projection has refuted this, and it is computed since"
+            found.append(f"the gradient of {self._from_f} is made of the components of f{until}")
+        return tuple(found)
 
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""

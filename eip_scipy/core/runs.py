@@ -153,7 +153,8 @@ class Run:
         options, sigma = projection.validate(method, self.stepping, y, f, invariants)
         self.conserved = conserved(self, y, f, tell and options.watched)
         if len(C := self.conserved.linear.C):
-            options = options._replace(frame=linear_rows((C, C.T), y.size, 1))
+            frame = linear_rows((C, C.T), y.size, 1)
+            options = options._replace(frame=frame._replace(value=frame.value.copy(), bodies=frame.bodies.copy()))
         masses = self.conserved.masses
         if masses.size:
             options = options._replace(masses=masses, uses_f=True)
@@ -293,6 +294,7 @@ class Run:
             _estimated=self.options.metric == data.BY_ERROR,
             moved=self.moved,
             _remarks=self.conserved.remarks,
+            _found_rows=self.found_rows.get("frame"),
             _from_f=listed([self.invariants.names[k] for k in self.conserved.rows_from_f]),
             _slow=(self.invariants.balances.places, w.slow),
         )
@@ -314,9 +316,10 @@ class Run:
         rhs, suspect = self.problem.derivative, self.work.suspect
         if self.trust.failed or not self.options.watched:  # a failure has its own message
             return False
-        if ended:
-            for text in filter(None, (self._fast_balances(), self._refuted_constraints(t, y, rhs))):
-                warnings.warn(text, UserWarning, stacklevel=users_level())
+        if ended and (text := self._fast_balances()):
+            warnings.warn(text, UserWarning, stacklevel=users_level())
+        if ended or is_check_due(steps):
+            self._drop_refuted_rows(t, y, rhs)
         found, is_flagged = None, suspect[REASON] != NOTHING
         if not self.trust.doubts:
             found = self.examiner.examine(suspect, rhs) if is_flagged else None
@@ -352,19 +355,21 @@ class Run:
             "it, or with other tolerances."
         )
 
-    def _refuted_constraints(self, t: float, y: Array, rhs: Derivative) -> str:
-        """Return a text if linear invariants that were found at the start do not hold at the state y, as in contact."""
-        linear = self.conserved.linear
-        if not len(linear.C) or linear.C.shape[1] != y.size:
-            return ""
-        lost = len(linear.C) - len(linear.only(confirmed(y[None], rhs(t, y)[None], linear)).C)
-        if not lost:
-            return ""
-        return (
-            f"{lost} of the {len(linear.C)} linear invariants that were found at the start do not hold at t={t:.6g}. "
-            "The corrections leave them unchanged, which may make the result less accurate. Pass "
-            "linear_invariants=None."
-        )
+    def _drop_refuted_rows(self, t: float, y: Array, rhs: Derivative) -> None:
+        """Let corrections change the linear invariants that were found at the start if one does not hold at y.
+
+        The engine goes on with rows of zeros.
+        """
+        linear, state = self.conserved.linear, self.tangents.state(y)
+        if len(linear.C) and not confirmed(state[None], self.tangents.state(rhs(t, y))[None], linear).all():
+            for array in self.found_rows.values():
+                array.fill(0.0)
+
+    @property
+    def found_rows(self) -> dict[str, Array]:
+        """Return by name the arrays of the linear invariants that were found; empty if there are none."""
+        frame = self.options.frame
+        return {"frame": frame.value, "bodies": frame.bodies} if len(self.conserved.linear.C) else {}
 
     @cached_property
     def examiner(self) -> Examiner:

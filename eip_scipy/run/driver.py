@@ -140,7 +140,7 @@ class Driver:
             place[PENDING], clock[TIME] = 0, clock[TIME_NEW]
         found = {"place": place, "clock": clock, "y": self.now[1], "slope": w.K[last], "balance_rate": w.rates[last]}
         found |= {"g": g, "rate": rate, "target": self.run.options.target}
-        found |= {name: getattr(w, name) for name in OF_WORK}
+        found |= {name: getattr(w, name) for name in OF_WORK} | self.run.found_rows
         return found | ({} if history is None else {f"history_{name}": getattr(history, name) for name in OF_HISTORY})
 
     def load(self, t: np.ndarray, y: np.ndarray) -> None:
