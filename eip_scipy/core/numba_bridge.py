@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from contextlib import suppress
 from functools import cache, lru_cache
 from itertools import count
 from types import CodeType, FunctionType
@@ -16,6 +17,7 @@ from numba.core.errors import NumbaError
 from numba.np.arrayobj import populate_array
 
 from ..engine.native import LibraryFunction
+from .arrays_into_out import into_out
 from .functions import ChangedShapeError, Kind, NotCompilableError
 
 __all__ = ["Compiled", "compiled", "compiled_or_none", "jitted_call"]
@@ -85,9 +87,19 @@ def compiled(fun: Any, kind: Kind, name: str, number: Any = None) -> Compiled:
 def _compile(fun: Any, kind: Kind, number: Any) -> tuple[int, Any, bool]:
     """Return the address of a C function, the owner of its code, and whether it returns None in some branches.
 
-    Equal functions, `kind` and `number` are compiled once in a process.
+    Equal functions, `kind` and `number` are compiled once in a process. Where it can be, a new array that the function
+    returns is `out` itself, see `arrays_into_out`.
     """
-    call = _with_all_arguments(fun, kind, _inner)
+    if len(kind.shape) == 1 and not kind.in_place and number is None:
+        with suppress(NumbaError):
+            return *_compiled(into_out(fun), kind, number, into=True), False
+    address, library = _compiled(fun, kind, number)
+    return address, library, any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures)
+
+
+def _compiled(fun: Any, kind: Kind, number: Any, *, into: bool = False) -> tuple[int, Any]:
+    """Return the address of a C function, and the owner of its code; `into`: `fun` is from `into_out`."""
+    call = _with_all_arguments(fun, kind, _inner, into=into)
 
     def array(scalar: Any, ndim: int) -> Any:
         return types.Array(number or scalar, ndim, "C", aligned=number is None)
@@ -98,8 +110,7 @@ def _compile(fun: Any, kind: Kind, number: Any) -> tuple[int, Any, bool]:
     arguments = types.float64, state, state, out, floats
     with global_compiler_lock:
         call.compile(arguments)
-        address, library = _c_function(call.overloads[arguments], kind)
-    return address, library, any(isinstance(known.return_type, types.Optional) for known in fun.nopython_signatures)
+        return _c_function(call.overloads[arguments], kind)
 
 
 def _c_function(compiled: Any, kind: Kind) -> tuple[int, Any]:
@@ -139,7 +150,7 @@ def _array(context: Any, builder: Any, kind: types.Array, data: Any, shape: tupl
     return array._getvalue()
 
 
-def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
+def _with_all_arguments(fun: Any, kind: Kind, jit: Any, *, into: bool = False) -> Any:
     """Return ``call(t, y, f, out, params)``, compiled by `jit`, which writes the value of `fun` to out.
 
     It is made from text as one function, because Numba takes a third less time for it than for functions that call
@@ -150,8 +161,9 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any) -> Any:
         given += [SCALARS[letter].format(k) for k, letter in enumerate(kind.scalars)]
     elif kind.p >= 0:
         given.append("params")
+    given += ["out"] * into
     dimensions = len(kind.shape)
-    put = PUT["values" if kind.real and dimensions == 1 else dimensions] if not kind.in_place else ()
+    put = PUT["values" if kind.real and dimensions == 1 else dimensions] if not (kind.in_place or into) else ()
     text = "\n    ".join(["def call(t, y, f, out, params):", f"value = fun({', '.join(given)})", *put])
     (code,) = (item for item in compile(text, "<call>", "exec").co_consts if isinstance(item, CodeType))
     return jit(FunctionType(code, {"fun": fun, "ChangedShapeError": ChangedShapeError}))
