@@ -4,7 +4,7 @@ All terms are chosen by numbers in the vector of parameters, so that one right-h
 G m of each body, then `N_ENTRIES` entries of the forces. The first body is the Sun; each force on another body has its
 reaction on the Sun, so that momentum and centre of mass are those of Newton. The full post-Newtonian equations ("eih")
 have another momentum and another centre of mass. They are in engine/cpp/problems/einstein.hpp, and the other forces in
-forces.cpp there. A new force is one row of `FORCES`.
+forces.cpp there. A new force is one row of `FORCES` here.
 """
 
 from __future__ import annotations
@@ -65,16 +65,17 @@ class ForceConstants:
 
 
 class Force(NamedTuple):
-    """The constants that a force needs, a function of them that returns its entries by place, and its relativity."""
+    """Constants that a force needs, a function that returns its entries by place, and the invariants that it keeps."""
 
     needs: tuple[str, ...]
     entries: Callable[[Any], dict[int, Any]]
+    keeps: tuple[str, ...] = ("H", "L")
     sees_velocity: bool = False
     is_relativity: bool = False
 
 
-def _relativity(kind: int, sees_velocity: bool) -> Force:
-    return Force(("c",), lambda k: {KIND: kind, OVER_C2: 1.0 / np.float64(k.c) ** 2}, sees_velocity, True)
+def _relativity(kind: int) -> Callable[[Any], dict[int, Any]]:
+    return lambda k: {KIND: kind, OVER_C2: 1.0 / np.float64(k.c) ** 2}
 
 
 def _drag(k: ForceConstants) -> dict[int, Any]:
@@ -88,12 +89,12 @@ def _pole(k: ForceConstants) -> dict[int, Any]:
 
 
 FORCES = {
-    "1pn": _relativity(1, sees_velocity=True),
-    "eih": _relativity(2, sees_velocity=True),
-    "gr-potential": _relativity(3, sees_velocity=False),
-    "j2": Force(("j2", "pole"), lambda k: {OBLATENESS: k.j2} | _pole(k)),
+    "1pn": Force(("c",), _relativity(1), sees_velocity=True, is_relativity=True),
+    "eih": Force(("c",), _relativity(2), sees_velocity=True, is_relativity=True),
+    "gr-potential": Force(("c",), _relativity(3), is_relativity=True),
+    "j2": Force(("j2", "pole"), lambda k: {OBLATENESS: k.j2} | _pole(k), keeps=("H", "L_pole")),
     "moon-quadrupole": Force(("moon_body", "moon"), lambda k: {MOON_BODY: k.moon_body, MOON: k.moon}),
-    "drag": Force(("drag", "drag_radius", "scale_height"), _drag, sees_velocity=True),
+    "drag": Force(("drag", "drag_radius", "scale_height"), _drag, keeps=(), sees_velocity=True),
 }
 """The forces by name; `nbody` describes each of them."""
 
@@ -161,16 +162,15 @@ def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
     """Return the invariants of the equations with these forces, see `nbody`."""
-    group = "forces" if forces else "gravity"
-    if "drag" in forces or ("1pn" in forces and (y0.size > 12 or len(forces) > 1)):
-        return ()
+    rows, group = [FORCES[name] for name in forces], "forces" if forces else "gravity"
     if "1pn" in forces:
-        group = "pair"
+        group = "pair" if y0.size <= 12 and len(forces) == 1 else ""
     elif "eih" in forces:
-        if not _small_second_order(params, y0):
-            return ()
-        group = "eih"
-    momentum = ("axial_momentum", "L_pole") if "j2" in forces else ("momentum", "L")
+        group = "eih" if _small_second_order(params, y0) else ""
+    if not (group and all(row.keeps for row in rows)):
+        return ()
+    axial = any("L_pole" in row.keeps for row in rows)
+    momentum = ("axial_momentum", "L_pole") if axial else ("momentum", "L")
     return tuple(native_invariant(f"{group}.{key}", name, params) for key, name in (("energy", "H"), momentum))
 
 
