@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import isfinite, log, log2, sqrt
 from typing import Any
 
@@ -139,7 +139,8 @@ class ParticleField:
     def check(self, position: np.ndarray, t: float = 0.0) -> None:
         """Raise ValueError if functions return wrong numbers of values, or contradict each other, at a point (3,)."""
         where = (t, *position)
-        plain = {key: self._of_time(fun) for key in SHAPES if (fun := getattr(self, key))}
+        # As partial functions, which are not compiled: that takes longer than a few calls.
+        plain = {key: self._of_time(partial(fun)) for key in SHAPES if (fun := getattr(self, key))}
         found = {key: _value(key, fun, where) for key, fun in plain.items()}
         for key, (source, derived, what) in CLAIMS.items():
             if not {key, source} <= found.keys() or (self.varies and key == "electric"):

@@ -1,7 +1,6 @@
 """Equations of motion, energies and angular momentum of a charged particle, from the functions of its field.
 
-A form of the state is given by two functions, the velocity and the canonical momentum; the rest follows from them. The
-functions are compiled if those of the field are jitted, otherwise they are plain Python. In compiled code they are
+The functions are compiled if those of the field are jitted, otherwise they are plain Python. In compiled code they are
 inlined, and what several of them compute is computed once, so that a loop is as fast as one written for the field.
 Components are written out, because Numba accepts only constant indices of a tuple such as (-y, x, 0), whose types
 differ.
@@ -70,10 +69,7 @@ def _canonical(field: Any) -> Motion:
         a, q, inverse = A(t, y[0], y[1], y[2]), params[CHARGE], 1.0 / params[MASS]
         return (y[3] - q * a[0]) * inverse, (y[4] - q * a[1]) * inverse, (y[5] - q * a[2]) * inverse
 
-    def momentum(t, y, params):
-        return y[3], y[4], y[5]
-
-    velocity, momentum = compiled_like(velocity, A), compiled_like(momentum, A)
+    velocity = compiled_like(velocity, A)
 
     def rhs(t, y, out, params):
         # x' = v and p_j' = q (sum_i v_i dA_i/dx_j + E_j)
@@ -88,6 +84,10 @@ def _canonical(field: Any) -> Motion:
         out[0], out[1], out[2] = -f[3], -f[4], -f[5]
         out[3], out[4], out[5] = f[0], f[1], f[2]
 
+    def momentum(t, y, params):
+        # L = x p_y - y p_x (Cai, Gong & Wang, eq. 3.9, with its misprint corrected)
+        return y[0] * y[4] - y[1] * y[3]
+
     def momentum_gradient(t, y, out, params):
         out[0], out[1], out[2] = y[4], -y[3], 0.0
         out[3], out[4], out[5] = -y[1], y[0], 0.0
@@ -95,7 +95,7 @@ def _canonical(field: Any) -> Motion:
     return Motion(
         compiled_like(rhs, A, jacobian, E),
         phi and (_energy(velocity, phi), compiled_like(energy_gradient, A, jacobian, E)),
-        (_angular_momentum(momentum), compiled_like(momentum_gradient, A)),
+        (compiled_like(momentum, A), compiled_like(momentum_gradient, A)),
     )
 
 
@@ -120,23 +120,22 @@ def _of_velocity(field: Any) -> Motion:
         return params[CHARGE] * (y[3] * e[0] + y[4] * e[1] + y[5] * e[2])
 
     def momentum(t, y, params):
+        # L = x p_y - y p_x with p = m v + q A
         a, m, q = A(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
-        return m * y[3] + q * a[0], m * y[4] + q * a[1], m * y[5] + q * a[2]
+        return y[0] * (m * y[4] + q * a[1]) - y[1] * (m * y[3] + q * a[0])
 
     def momentum_gradient(t, y, out, params):
-        (px, py, _), m, q = momentum(t, y, params), params[MASS], params[CHARGE]
-        d = jacobian(t, y[0], y[1], y[2])
-        out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0]) + py
-        out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1]) - px
+        a, d, m, q = A(t, y[0], y[1], y[2]), jacobian(t, y[0], y[1], y[2]), params[MASS], params[CHARGE]
+        out[0] = q * (y[0] * d[1][0] - y[1] * d[0][0] + a[1]) + m * y[4]
+        out[1] = q * (y[0] * d[1][1] - y[1] * d[0][1] - a[0]) - m * y[3]
         out[2] = q * (y[0] * d[1][2] - y[1] * d[0][2])
         out[3], out[4], out[5] = -m * y[1], m * y[0], 0.0
 
     velocity, nothing, still = (compiled_like(fun, E) for fun in (velocity, no_force, no_potential))
-    momentum = A and compiled_like(momentum, A)
     return Motion(
         compiled_like(rhs, E, B),
         phi and (_energy(velocity, phi), _energy_gradient(E)),
-        A and (_angular_momentum(momentum), compiled_like(momentum_gradient, A, jacobian)),
+        A and (compiled_like(momentum, A), compiled_like(momentum_gradient, A, jacobian)),
         (_energy(velocity, still), compiled_like(power, E), _energy_gradient(nothing)),
     )
 
@@ -157,12 +156,3 @@ def _energy_gradient(E: Function) -> Function:
         out[3], out[4], out[5] = m * y[3], m * y[4], m * y[5]
 
     return compiled_like(gradient, E)
-
-
-def _angular_momentum(momentum: Function) -> Function:
-    def value(t, y, params):
-        # L = x p_y - y p_x (Cai, Gong & Wang, eq. 3.9, with its misprint corrected)
-        px, py, _ = momentum(t, y, params)
-        return y[0] * py - y[1] * px
-
-    return compiled_like(value, momentum)
