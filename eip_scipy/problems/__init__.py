@@ -6,7 +6,8 @@ from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
 from .gravity.orbital_elements import OrbitalElements, orbital_elements
 from .gravity.orbits import orbital_balances
-from .gravity.scenes import comet, figure_eight, pythagorean, satellite
+from .gravity.satellite import satellite
+from .gravity.scenes import comet, figure_eight, pythagorean
 from .gravity.solar_data import SolarSystemData
 from .gravity.solar_system import solar_system
 from .gross_pitaevskii import FieldProblem, Grid, GrossPitaevskii

@@ -45,8 +45,16 @@ def pair_time(y, params):
     return 1.0 / sqrt(rate2)
 
 
+def reaches(t: float) -> Callable[..., float]:
+    """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t)."""
+    t = float(t)
+    event = jitted(compilable(lambda s, y, params: y[-1] - t))
+    event.terminal = True
+    return event
+
+
 def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pair_time) -> Problem:
-    """Return a problem in fictitious time s, dt = g(y) ds.
+    """Return a problem in fictitious time s, dt = g(y) ds (Sundman 1913; Mikkola and Tanikawa 1999).
 
     Parameters
     ----------
@@ -63,23 +71,13 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     Returns
     -------
     Problem
-        A problem with the state (y, t), where t = ``problem.t_span[0]`` at the start. It has the same invariants,
-        blocks and linear invariants, which do not contain t. It has no step `h`.
+        A problem of first order with the state (y, t), where t = ``problem.t_span[0]`` at the start. It has the same
+        invariants, blocks and linear invariants, which do not contain t, and no step `h`.
 
     Raises
     ------
     ValueError
         If the problem has no compiled right-hand side, or one of its invariants is a `Balance` or depends on t.
-
-    Notes
-    -----
-    The system is of first order, so that Nyström methods cannot be used.
-
-    References
-    ----------
-    K. F. Sundman, Mémoire sur le problème des trois corps, Acta Mathematica 36 (1913) 105-179. The exponent 3/2, for
-    which dt / ds is the local time scale: S. Mikkola, K. Tanikawa, Celestial Mechanics and Dynamical Astronomy 74
-    (1999) 287-295.
     """
     if problem.rhs is None:
         raise ValueError(
@@ -92,7 +90,9 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
             "Pass dataclasses.replace(problem, y0=..., t_span=...)."
         )
     params = np.zeros(0) if problem.params is None else problem.params
-    rhs = _transformed_rhs(jitted_call(problem.rhs), jitted(g))
+    for item in problem.invariants:
+        _check_time(item, problem, params)
+    rhs = _equations(jitted_call(problem.rhs), jitted(g))
     n, blocks, kept = problem.y0.size, problem.blocks, problem.linear_invariants
     if kept is not None:
         kept = np.pad(kept[0], ((0, 0), (0, 1))), np.pad(kept[1], ((0, 1), (0, 0)))
@@ -103,7 +103,7 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
         y0=np.append(problem.y0, problem.t_span[0]),
         t_span=(0.0, float(s_end)),
         params=params,
-        invariants=tuple(_transformed_invariant(item, problem) for item in problem.invariants),
+        invariants=tuple(map(_invariant, problem.invariants)),
         component_names=None if problem.component_names is None else (*problem.component_names, "t"),
         blocks=tuple(np.arange(n).reshape(-1, blocks)) if isinstance(blocks, int) else blocks,
         linear_invariants=kept,
@@ -112,21 +112,27 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     )
 
 
-def reaches(t: float) -> Callable[..., float]:
-    """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t)."""
-    t = float(t)
-
-    def event(s, y, params):
-        return y[-1] - t
-
-    made = jitted(compilable(event))
-    made.terminal = True
-    return made
+def _check_time(item: Invariant, problem: Problem, params: np.ndarray) -> None:
+    """Raise ValueError for a balance, and for an invariant whose values at three times differ."""
+    why = "is a Balance, whose rate is a derivative with respect to time"
+    if not item.is_balance:
+        t0, t1 = problem.t_span
+        fun, args = own_values(item.function), item.args or (params,)
+        values = [fun(t, problem.y0, *args) for t in (t0, t0 + 0.37 * (t1 - t0), t1)]
+        if all(np.array_equal(value, values[0], equal_nan=True) for value in values):
+            return
+        why = "depends on t, but the gradient with respect to the state (y, t) is known only for invariants of y"
+    raise ValueError(
+        f"time_transformed: {item!r} {why}. Pass dataclasses.replace(problem, invariants=...) without it; the new "
+        "problem may get one that is written in fictitious time."
+    )
 
 
 # The functions are cached, so that they are compiled once for all problems with the same functions.
+
+
 @cache
-def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
+def _equations(rhs: Callable[..., None], g: Callable[..., Any]) -> Callable[..., None]:
     def transformed(s, y, out, params):
         n = y.size - 1
         rhs(y[n], y[:n], out[:n], params)
@@ -138,36 +144,16 @@ def _transformed_rhs(rhs: Callable[..., None], g: Callable[..., Any]) -> Callabl
     return compiled_like(transformed, rhs, g)
 
 
-def _transformed_invariant(item: Invariant, problem: Problem) -> Invariant:
-    if item.is_balance:
-        raise ValueError(
-            f"time_transformed: {item!r} is a Balance, whose rate is a derivative with respect to time. Pass "
-            "dataclasses.replace(problem, invariants=...) without it. The new problem may get a Balance in the same "
-            "way, with the rate in fictitious time."
-        )
-    if _depends_on_time(item, problem):
-        raise ValueError(
-            f"time_transformed: {item!r} depends on t, but the gradient with respect to the state (y, t) is known only "
-            "for invariants of y. Pass dataclasses.replace(problem, invariants=...) without it."
-        )
-    fun, grad = _transformed_functions(jitted_call(item.function), jitted_call(item.gradient), item.uses_f)
-    return Invariant(fun, grad, args=item.args, in_place=True, uses_f=item.uses_f, name=item.name, scale=item.scale)
-
-
-def _depends_on_time(item: Invariant, problem: Problem) -> bool:
-    """Return True if the values of an invariant at the problem's initial state differ between three times."""
-    params = np.zeros(0) if problem.params is None else problem.params
-    t0, t1 = problem.t_span
-    fun = own_values(item.function)
-    values = [fun(t, problem.y0, *(item.args or (params,))) for t in (t0, t0 + 0.37 * (t1 - t0), t1)]
-    return not all(np.array_equal(value, values[0], equal_nan=True) for value in values)
+def _invariant(item: Invariant) -> Invariant:
+    """Return an invariant of y as one of (y, t); a gradient that is not filled in place is computed."""
+    form = {"in_place": True, "uses_f": item.uses_f} if item.in_place else {}
+    fun, grad = _value_and_gradient(jitted_call(item.function), jitted_call(item.gradient), item.uses_f)
+    return Invariant(fun, grad if form else None, args=item.args, name=item.name, scale=item.scale, **form)
 
 
 @cache
-def _transformed_functions(
-    fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Return value and gradient of an invariant of y as functions of s and the state (y, t); f is dy/ds over dt/ds."""
+def _value_and_gradient(fun: Callable[..., Any], grad: Callable[..., Any], uses_f: bool) -> tuple[Any, Any]:
+    """Return functions of s and (y, t) for those of an invariant of y, whose f, dy/dt, is dy/ds over dt/ds."""
 
     def value(s, y, params):
         return fun(y[-1], y[:-1], params)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numba import njit
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, check_gradient, hamiltonian, integrate
 from eip_scipy.problems import (
@@ -190,6 +191,18 @@ def test_circular_orbit_takes_two_pi():
     q, v = np.pad(one.y0.reshape(2, 1, 2) / 2, ((0, 0), (0, 0), (0, 1)))  # two bodies around their centre
     pair = np.concatenate([q, -q, v, -v]).ravel()
     assert pair_time(pair, gm) == pytest.approx(centre_time(one.y0, one.params), rel=1e-14)
+
+
+@pytest.mark.needs_jit
+def test_fictitious_time_with_invariants_of_a_user():
+    """Without a gradient, and with one that is returned."""
+    energy = njit(lambda t, y, params: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.hypot(y[0], y[1]))
+    slope = njit(lambda t, y, params: y[::-1] * np.array([1, -1, -1, 1]))
+    momentum = Invariant(njit(lambda t, y, params: y[0] * y[3] - y[1] * y[2]), slope)
+    problem = replace(kepler(0.9, 0.0), invariants=(energy, momentum))
+    run = integrate(time_transformed(problem, 50.0, centre_time), method=EIPRK4, h=0.02)
+    assert run.compiled
+    assert run.max_residual.max() < 1e-13
 
 
 @pytest.mark.slow

@@ -1,18 +1,18 @@
 """Forces in addition to Newton's gravitation: relativity, oblateness, a Moon without orbit, drag.
 
-All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination:
-first G m of each body, then the entries that `parameters` lists. The first body is the Sun; each force on another body
-has its reaction on the Sun, so that momentum and centre of mass are those of Newton. The full post-Newtonian equations
-("eih") have another momentum and another centre of mass. They are in engine/cpp/problems/einstein.hpp, and the other
-forces in forces.cpp there.
+All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination: first
+G m of each body, then `N_ENTRIES` entries of the forces. The first body is the Sun; each force on another body has its
+reaction on the Sun, so that momentum and centre of mass are those of Newton. The full post-Newtonian equations ("eih")
+have another momentum and another centre of mass. They are in engine/cpp/problems/einstein.hpp, and the other forces in
+forces.cpp there. A new force is one row of `FORCES` here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,22 +21,10 @@ from ...core.names import nearest
 from ...core.problem import native_invariant
 from ...engine.native import library
 
-__all__ = ["FORCES", "ForceConstants", "acceleration", "check_forces", "equations", "invariants", "parameters"]
+__all__ = ["FORCES", "ForceConstants", "check_forces", "equations", "invariants", "parameters"]
 
-FORCES = {
-    "1pn": "first post-Newtonian terms of the Sun's field, harmonic coordinates",
-    "eih": "first post-Newtonian terms of all bodies (Einstein, Infeld & Hoffmann)",
-    "gr-potential": "a potential in 1/r^2 that advances perihelia as relativity does (Nobili & Roxburgh)",
-    "j2": "the Sun's oblateness J2",
-    "moon-quadrupole": "the Moon smeared out along a circle around the Earth",
-    "drag": "drag in the first body's atmosphere, whose density falls exponentially",
-}
-"""Names of the forces, with a description of each."""
-
-RELATIVITY = ("1pn", "eih", "gr-potential")
-VELOCITY_DEPENDENT = ("1pn", "eih", "drag")
-# Entries after the G m: which relativity (0: none, else 1 + its place in RELATIVITY), 1/c^2, J2 R^2, the pole (3), the
-# body with the Moon, its coefficient; of drag the coefficient, where it holds, the scale height and the air's rotation.
+# Entries after the G m: which relativity (0: none), 1/c^2, J2 R^2, the pole (3), the body with the Moon (-1: none), its
+# coefficient; of drag the coefficient, where it holds, the scale height and the air's rotation.
 KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY, MOON, DRAG, N_ENTRIES = 0, 1, 2, 3, 6, 7, 8, 12
 # Round-off of an energy in which large terms nearly cancel: what "kept" means for invariants that are not exact.
 KEPT = 1e-13
@@ -56,18 +44,13 @@ class ForceConstants:
         J2 times the square of the Sun's equatorial radius, for "j2".
     pole : sequence of 3 floats, optional
         Vector of any length along the Sun's axis of rotation, for "j2", and for "drag" with `spin`.
-    moon_body : int, optional
-        Index of the body that stands for Earth and Moon, for "moon-quadrupole".
-    moon : float, optional
-        ``a^2 m_E m_M / (4 (m_E + m_M)^2)`` with the radius a of the Moon's orbit, for "moon-quadrupole".
-    drag : float, optional
-        Acceleration divided by the squared speed relative to the air, at the distance `drag_radius`: half the density
-        of the air times c_D A / m of the bodies, for "drag".
-    drag_radius, scale_height : float, optional
-        Distance from the first body at which `drag` holds, and the distance over which the density falls by a factor
-        of e, for "drag".
-    spin : float, optional
-        Angular velocity of the atmosphere about the pole, 0 by default, for "drag".
+    moon_body, moon : int and float, optional
+        Index of the body that stands for Earth and Moon, and ``a^2 m_E m_M / (4 (m_E + m_M)^2)`` with the radius a of
+        the Moon's orbit, for "moon-quadrupole".
+    drag, drag_radius, scale_height, spin : float, optional
+        Acceleration divided by the squared speed relative to the air, which is half the density of the air times
+        c_D A / m of the bodies, at the distance `drag_radius` from the first body; the distance over which the density
+        falls by a factor of e; and the angular velocity of the air about the pole, for "drag".
     """
 
     c: float | None = None
@@ -81,14 +64,39 @@ class ForceConstants:
     spin: float = 0.0
 
 
-NEEDS = {
-    "1pn": ("c",),
-    "eih": ("c",),
-    "gr-potential": ("c",),
-    "j2": ("j2", "pole"),
-    "moon-quadrupole": ("moon_body", "moon"),
-    "drag": ("drag", "drag_radius", "scale_height"),
+class Force(NamedTuple):
+    """Constants that a force needs, a function that returns its entries by place, and the invariants that it keeps."""
+
+    needs: tuple[str, ...]
+    entries: Callable[[Any], dict[int, Any]]
+    keeps: tuple[str, ...] = ("H", "L")
+    sees_velocity: bool = False
+    is_relativity: bool = False
+
+
+def _relativity(kind: int) -> Callable[[Any], dict[int, Any]]:
+    return lambda k: {KIND: kind, OVER_C2: 1.0 / np.float64(k.c) ** 2}
+
+
+def _drag(k: ForceConstants) -> dict[int, Any]:
+    air = {DRAG: k.drag, DRAG + 1: k.drag_radius, DRAG + 2: k.scale_height, DRAG + 3: k.spin}
+    return air | (_pole(k) if k.spin else {})
+
+
+def _pole(k: ForceConstants) -> dict[int, Any]:
+    pole = np.asarray(k.pole, dtype=float)
+    return dict(enumerate(pole / np.linalg.norm(pole), POLE))
+
+
+FORCES = {
+    "1pn": Force(("c",), _relativity(1), sees_velocity=True, is_relativity=True),
+    "eih": Force(("c",), _relativity(2), sees_velocity=True, is_relativity=True),
+    "gr-potential": Force(("c",), _relativity(3), is_relativity=True),
+    "j2": Force(("j2", "pole"), lambda k: {OBLATENESS: k.j2} | _pole(k), keeps=("H", "L_pole")),
+    "moon-quadrupole": Force(("moon_body", "moon"), lambda k: {MOON_BODY: k.moon_body, MOON: k.moon}),
+    "drag": Force(("drag", "drag_radius", "scale_height"), _drag, keeps=(), sees_velocity=True),
 }
+"""The forces by name; `nbody` describes each of them."""
 
 
 def check_forces(forces: Any) -> tuple[str, ...]:
@@ -102,43 +110,30 @@ def check_forces(forces: Any) -> tuple[str, ...]:
         if name not in FORCES:
             hint = nearest(str(name).lower(), FORCES, cutoff=0.4)
             raise ValueError(f"unknown force {name!r}; known: {', '.join(map(repr, FORCES))}{hint}")
-    found = tuple(name for name in FORCES if name in names)
-    if len(kinds := [name for name in found if name in RELATIVITY]) > 1:
+    if len(kinds := [name for name in FORCES if name in names and FORCES[name].is_relativity]) > 1:
         raise ValueError(f"the forces {' and '.join(map(repr, kinds))} all describe relativity; give only one of them")
-    return found
+    return tuple(name for name in FORCES if name in names)
 
 
 def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstants | None) -> np.ndarray:
-    """Return the vector of parameters: G m of all bodies, then the parameters of the forces.
+    """Return the vector of parameters: G m of all bodies, then the entries of the forces, if there are any.
 
     A ValueError is raised if a constant is missing or wrong, or the first body has no mass.
     """
-    known = ForceConstants() if constants is None else constants
-    for force in forces:
-        for name in NEEDS[force]:
-            _check_constant(force, name, getattr(known, name), gm.size)
-    if "drag" in forces and known.spin != 0:
-        _check_constant("drag", "pole", known.pole, gm.size)
-        if not isfinite(known.spin):
-            raise ValueError(f"ForceConstants: spin must be a finite number; got {known.spin!r}.")
+    if not forces:
+        return gm
+    known, entries = ForceConstants() if constants is None else constants, np.zeros(N_ENTRIES)
+    entries[MOON_BODY] = -1.0
+    for name in forces:
+        needs, places, *_ = FORCES[name]
+        for key in (*needs, "spin", "pole") if name == "drag" and known.spin != 0 else needs:
+            _check_constant(name, key, getattr(known, key), gm.size)
+        for place, value in places(known).items():
+            entries[place] = value
     if not gm[0] > 0:
         raise ValueError(
             f"forces: the first body must be the one that exerts the forces, with G m > 0; its G m is {gm[0]!r}."
         )
-    entries = np.zeros(N_ENTRIES)
-    entries[MOON_BODY] = -1.0
-    for place, name in enumerate(RELATIVITY, 1):
-        if name in forces:
-            entries[KIND], entries[OVER_C2] = place, 1.0 / np.float64(known.c) ** 2
-    if "j2" in forces:
-        entries[OBLATENESS] = known.j2
-    if "drag" in forces:
-        entries[DRAG:] = known.drag, known.drag_radius, known.scale_height, known.spin
-    if known.pole is not None and {"j2", "drag"} & set(forces):
-        pole = np.asarray(known.pole, dtype=float)
-        entries[POLE : POLE + 3] = pole / np.linalg.norm(pole)
-    if "moon-quadrupole" in forces:
-        entries[MOON_BODY], entries[MOON] = known.moon_body, known.moon
     return np.concatenate([gm, entries])
 
 
@@ -146,47 +141,37 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
     if value is None:
         raise ValueError(f"the force {force!r} needs constants=ForceConstants({name}=...), in the units of the state.")
     if name == "pole":
-        pole = np.asarray(value, dtype=float)
-        if pole.shape != (3,) or not np.isfinite(pole).all() or not pole.any():
-            raise ValueError(f"ForceConstants: pole must be three finite numbers, not all 0; got {value!r}.")
+        pole, expected = np.asarray(value, dtype=float), "three finite numbers, not all 0"
+        fits = pole.shape == (3,) and np.isfinite(pole).all() and pole.any()
     elif name == "moon_body":
-        if not (isinstance(value, int | np.integer) and 0 < value < n):
-            raise ValueError(f"ForceConstants: moon_body must be an index from 1 to {n - 1}; got {value!r}.")
-    elif not (isfinite(value) and value > 0):
-        raise ValueError(f"ForceConstants: {name} must be a finite positive number; got {value!r}.")
+        fits, expected = isinstance(value, int | np.integer) and 0 < value < n, f"an index from 1 to {n - 1}"
+    elif name == "spin":
+        fits, expected = isfinite(value), "a finite number"
+    else:
+        fits, expected = isfinite(value) and value > 0, "a finite positive number"
+    if not fits:
+        raise ValueError(f"ForceConstants: {name} must be {expected}; got {value!r}.")
 
 
 def equations(forces: tuple[str, ...]) -> tuple[Any, Any]:
     """Return the right-hand side, and the accelerations if they depend on positions only (else None)."""
-    if not forces:
-        return library["gravity.rhs"], library["gravity.acc"]
-    return library["forces.rhs"], None if set(forces) & set(VELOCITY_DEPENDENT) else library["forces.acc"]
-
-
-def acceleration(y: np.ndarray, params: np.ndarray) -> np.ndarray:
-    """Return the accelerations (N, 3) of all bodies in the state `y`, by gravitation and the forces in `params`."""
-    out = np.empty_like(y)
-    library["forces.rhs"](0.0, y, out, params)
-    return out[y.size // 2 :].reshape(-1, 3)
+    group = "forces" if forces else "gravity"
+    sees_velocity = any(FORCES[name].sees_velocity for name in forces)
+    return library[f"{group}.rhs"], None if sees_velocity else library[f"{group}.acc"]
 
 
 def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> tuple[Invariant, ...]:
     """Return the invariants of the equations with these forces, see `nbody`."""
-    if not forces:
-        return native_invariant("gravity.energy", "H", params), native_invariant("gravity.momentum", "L", params)
-    if "drag" in forces:
-        return ()
+    rows, group = [FORCES[name] for name in forces], "forces" if forces else "gravity"
     if "1pn" in forces:
-        if y0.size > 12 or len(forces) > 1:
-            return ()
-        return native_invariant("pair.energy", "H", params), native_invariant("pair.momentum", "L", params)
-    if "eih" in forces and not _small_second_order(params, y0):
+        group = "pair" if y0.size <= 12 and len(forces) == 1 else ""
+    elif "eih" in forces:
+        group = "eih" if _small_second_order(params, y0) else ""
+    if not (group and all(row.keeps for row in rows)):
         return ()
-    kind = "eih" if "eih" in forces else "forces"
-    energy = native_invariant(f"{kind}.energy", "H", params)
-    if "j2" in forces:
-        return energy, native_invariant(f"{kind}.axial_momentum", "L_pole", params)
-    return energy, native_invariant(f"{kind}.momentum", "L", params)
+    axial = any("L_pole" in row.keeps for row in rows)
+    momentum = ("axial_momentum", "L_pole") if axial else ("momentum", "L")
+    return tuple(native_invariant(f"{group}.{key}", name, params) for key, name in (("energy", "H"), momentum))
 
 
 def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
@@ -195,10 +180,10 @@ def _small_second_order(params: np.ndarray, y0: np.ndarray) -> bool:
     They are about v^2/c^2 times the accelerations that "eih" adds to Newton's.
     """
     n = y0.size // 6
-    newton = np.empty_like(y0)
+    newton, found = np.empty_like(y0), np.empty_like(y0)
     library["gravity.rhs"](0.0, y0, newton, params[:n])
-    a = newton[3 * n :].reshape(-1, 3)
+    library["forces.rhs"](0.0, y0, found, params)
+    v, a, added = (part[3 * n :].reshape(-1, 3) for part in (y0, newton, found - newton))
     size = np.linalg.norm(a, axis=1)
-    added = np.linalg.norm(acceleration(y0, params) - a, axis=1)[size > 0] / size[size > 0]
-    v2 = np.sum(y0[3 * n :].reshape(-1, 3) ** 2, axis=1)
-    return bool(v2.max() * params[n + OVER_C2] * added.max(initial=0.0) < KEPT)
+    added = np.linalg.norm(added, axis=1)[size > 0] / size[size > 0]
+    return bool(np.sum(v**2, axis=1).max() * params[n + OVER_C2] * added.max(initial=0.0) < KEPT)

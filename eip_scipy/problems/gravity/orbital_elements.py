@@ -11,7 +11,7 @@ from ...core.inputs import real_array, shown
 from ...core.problem import Problem
 from .bodies import bodies_of
 
-__all__ = ["OrbitalElements", "orbital_elements"]
+__all__ = ["OrbitalElements", "elements_of", "orbital_elements"]
 
 PRIMARIES = ("jacobi", "heliocentric", "barycentric")
 # Below this inclination, or as near to pi, the node is all but undefined, and angles are measured from the x axis.
@@ -32,31 +32,21 @@ class OrbitalElements:
         Names of the bodies that move on the orbits, in the order of the arrays.
     t : ndarray, shape (m,), or None
         Times of the states; None if the states have no times.
-    a : ndarray
-        Semi-major axis, negative for a hyperbola.
-    e : ndarray
-        Eccentricity.
+    a, e : ndarray
+        Semi-major axis, negative for a hyperbola, and eccentricity.
     inc : ndarray
         Inclination to the plane of x and y, from 0 to pi. Angles are in radians.
-    Omega : ndarray
-        Longitude of the ascending node, from 0 to 2 pi, as are the angles that follow.
-    omega : ndarray
-        Argument of the pericentre.
-    pomega : ndarray
-        Longitude of the pericentre, Omega + omega; for a retrograde orbit Omega - omega.
-    f : ndarray
-        True anomaly.
-    M : ndarray
-        Mean anomaly, n times the time since the pericentre. For a hyperbola it is not reduced to the range from 0 to
-        2 pi, unlike in REBOUND. NaN for a parabola.
-    theta : ndarray
-        True longitude, Omega + omega + f; for a retrograde orbit Omega - omega - f.
-    l : ndarray
-        Mean longitude, Omega + omega + M; for a retrograde orbit Omega - omega - M.
-    n : ndarray
-        Mean motion in radians per unit of time; negative for a hyperbola, as in REBOUND.
-    P : ndarray
-        Period, 2 pi / n; negative for a hyperbola.
+    Omega, omega, pomega : ndarray
+        Longitude of the ascending node, argument of the pericentre, and longitude of the pericentre, Omega + omega, or
+        Omega - omega for a retrograde orbit; from 0 to 2 pi, as are the angles that follow.
+    f, M : ndarray
+        True anomaly and mean anomaly, n times the time since the pericentre. M of a hyperbola is not reduced to the
+        range from 0 to 2 pi, unlike in REBOUND. NaN for a parabola.
+    theta, l : ndarray
+        True and mean longitude, Omega + omega + f and Omega + omega + M; for a retrograde orbit Omega - omega - f and
+        Omega - omega - M.
+    n, P : ndarray
+        Mean motion in radians per unit of time, and period 2 pi / n; negative for a hyperbola, as in REBOUND.
     """
 
     bodies: tuple[str, ...]
@@ -122,8 +112,6 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
 
     Near a circle, or near an orbit in the plane of reference, single angles lose digits, because the angles themselves
     are almost undefined: an error of 1e-16 of the state moves omega by 1e-16 / e. The sums of angles keep their digits.
-    Angles are computed by arc tangents of two components. Therefore angles near 0 and pi do not lose half of their
-    digits, as they would with an arc cosine.
 
     Examples
     --------
@@ -135,27 +123,24 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
     ((9, 11), 5.2)
     """
     state, t, masses, names = _read(run, gm)
-    if primary == "jacobi":
-        relative, mu = _jacobi(state, masses)
-        orbiting = list(range(1, len(names)))
-    else:
-        relative, mu, orbiting = _around(state, masses, primary, names)
-    return OrbitalElements(tuple(names[k] for k in orbiting), t, **_elements(relative, mu))
+    orbiting, centre, mu = _centre(state, masses, primary, names)
+    bodies = tuple(names[k] for k in orbiting)
+    return OrbitalElements(bodies, t, **elements_of(np.moveaxis(state[:, orbiting] - centre, 2, 1), mu))
 
 
 def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, tuple[str, ...]]:
     """Return the states (2, N, 3, ...), times, G m and names of the bodies, from arguments of `orbital_elements`."""
-    t, names = None, None
-    if hasattr(run, "y") and hasattr(run, "t"):
+    y, t, names = run, None, None
+    if isinstance(run, Problem):
+        y = run.y0
+    elif hasattr(run, "y") and hasattr(run, "t"):
         y, t, names = run.y, np.asarray(run.t, dtype=float), getattr(run, "component_names", None)
         gm = run.gm if gm is None and "gm" in run else gm
-    else:
-        y = run.y0 if isinstance(run, Problem) else run
+    elif gm is None and isinstance(run, (np.ndarray, list, tuple)):
+        raise TypeError("orbital_elements: states alone have no masses; give gm, G times the mass of each body.")
     if gm is None:
-        bodies = bodies_of(run) if not isinstance(run, (np.ndarray, list, tuple)) else None
-        if bodies is None:
-            raise TypeError("orbital_elements: states alone have no masses; give gm, G times the mass of each body.")
-        gm, names = bodies.gm, bodies.problem.component_names
+        problem, gm, *_ = bodies_of(run)
+        names = problem.component_names
     masses, y = real_array("gm", gm), real_array("y", y)
     n = masses.size
     if masses.ndim != 1 or n < 2 or y.ndim not in (1, 2) or y.shape[0] != 6 * n:
@@ -169,110 +154,80 @@ def _read(run: Any, gm: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray,
     return y.reshape(2, n, 3, *y.shape[1:]), t, masses, labels
 
 
-def _jacobi(state: np.ndarray, gm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the states relative to the centre of mass of all bodies before each body, and G m of all up to it."""
-    if not gm[0] > 0:
-        raise ValueError(
-            f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}. "
-            "Put a body with a mass first, or give another primary."
-        )
-    total = np.cumsum(gm)
-    weighted = gm.reshape(-1, 1, *[1] * (state.ndim - 3)) * state
-    centres = np.cumsum(weighted, axis=1) / total.reshape(-1, 1, *[1] * (state.ndim - 3))
-    return state[:, 1:] - centres[:, :-1], total[1:]
-
-
-def _around(
+def _centre(
     state: np.ndarray, gm: np.ndarray, primary: str | int, names: tuple[str, ...]
-) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return the states relative to `primary`, the gravitational parameters, and the indices of the orbiting bodies."""
-    every = list(range(gm.size))
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Return the indices (k,) of the bodies with orbits, the centres (2, k or 1, 3, ...) and G m (k,) of these."""
+    every, gm_of_rows = list(range(gm.size)), gm.reshape(-1, *[1] * (state.ndim - 2))
+    if primary == "jacobi":
+        if not gm[0] > 0:
+            raise ValueError(
+                f"orbital_elements: primary='jacobi' needs a first body with a mass, but its G m is {gm[0]!r}. "
+                "Put a body with a mass first, or give another primary."
+            )
+        centres = np.cumsum(gm_of_rows * state, axis=1) / np.cumsum(gm_of_rows, axis=0)
+        return every[1:], centres[:, :-1], np.cumsum(gm)[1:]
     if primary == "barycentric":
         total = gm.sum()
-        return state - (np.tensordot(gm / total, state, axes=(0, 1)))[:, None], total + gm, every
-    if primary == "heliocentric":
-        k = 0
-    elif primary in names:
-        k = names.index(str(primary))
-    elif isinstance(primary, (int, np.integer)) and not isinstance(primary, bool) and 0 <= primary < gm.size:
-        k = int(primary)
-    else:
+        return every, np.tensordot(gm / total, state, axes=(0, 1))[:, None], total + gm
+    k: Any = 0 if primary == "heliocentric" else primary
+    k = names.index(k) if k in names else k
+    if isinstance(k, bool) or k not in every:
         raise ValueError(
             f"orbital_elements: unknown primary {shown(primary)}; expected one of {', '.join(map(repr, PRIMARIES))}, a "
             f"number from 0 to {gm.size - 1}, or one of the names {', '.join(names)}."
         )
-    others = [i for i in every if i != k]
     if gm[k] == 0:
         raise ValueError(
             f"orbital_elements: the primary {names[k]!r} has no mass, so nothing orbits it. Give another primary."
         )
-    return state[:, others] - state[:, [k]], gm[k] + gm[others], others
+    every.remove(k)
+    return every, state[:, [k]], gm[k] + gm[every]
 
 
-def _elements(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the elements (bodies, ...) of relative states (2, bodies, 3, ...) by their names in `OrbitalElements`."""
-    (x, y, z), (vx, vy, vz) = np.moveaxis(state, 2, 1)
-    mu = mu.reshape(-1, *[1] * (x.ndim - 1))
-    # Adding 0 leaves no -0, whose arc tangent is pi.
-    hx, hy, hz = y * vz - z * vy + 0.0, z * vx - x * vz, x * vy - y * vx
-    r = np.sqrt(x**2 + y**2 + z**2)
-    v2, rv = vx**2 + vy**2 + vz**2, x * vx + y * vy + z * vz
-    level = np.hypot(hx, hy)
-    h = np.hypot(level, hz)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        a = mu / (2 * mu / r - v2)
-        ex, ey, ez = ((v2 - mu / r) * q - rv * v for q, v in ((x, vx), (y, vy), (z, vz)))
-        ex, ey, ez = ex / mu, ey / mu, ez / mu
-        e = np.sqrt(ex**2 + ey**2 + ez**2)
-        n = np.copysign(np.sqrt(np.abs(mu / a**3)), a)
-        period = TURN / n
-    inc = np.arctan2(level, hz)
-    Omega = np.arctan2(hx, -hy + 0.0)  # along the node (-hy, hx, 0)
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")
+def elements_of(state: np.ndarray, mu: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the elements (bodies, ...) of relative states (2, 3, bodies, ...) by their names in `OrbitalElements`."""
+    q, v = state
+    mu = mu.reshape(-1, *[1] * (q.ndim - 2))
+    h = np.cross(q, v, axis=0) + 0.0  # adding 0 leaves no -0, whose arc tangent is pi
+    r, level, size = np.sqrt((q * q).sum(axis=0)), np.hypot(h[0], h[1]), np.hypot(np.hypot(h[0], h[1]), h[2])
+    v2, rv = (v * v).sum(axis=0), (q * v).sum(axis=0)
+    a = mu / (2 * mu / r - v2)
+    to_pericentre = ((v2 - mu / r) * q - rv * v) / mu
+    e = np.sqrt((to_pericentre**2).sum(axis=0))
+    n = np.copysign(np.sqrt(np.abs(mu / a**3)), a)
+    inc = np.arctan2(level, h[2])
+    Omega = np.arctan2(h[0], -h[1] + 0.0)  # along the node (-hy, hx, 0)
     flat = (inc < FLAT) | (inc > np.pi - FLAT)
     turns = np.where(inc < np.pi / 2, 1.0, -1.0)  # in which sense longitudes grow along the orbit
-    # Angles from the node in the plane of the orbit; from the x axis where that plane is flat.
-    from_node = [_in_plane(q, (hx, hy, hz), level, h) for q in ((x, y, z), (ex, ey, ez))]
-    position, pericentre = (
-        np.where(flat, turns * (np.arctan2(q[1], q[0]) - Omega), angle)
-        for q, angle in zip(((x, y), (ex, ey)), from_node, strict=True)
-    )
+
+    def from_node(x: np.ndarray) -> np.ndarray:
+        """Return the angle in the orbit from the node to x; in a flat orbit its sum with Omega is from the x axis."""
+        along = h[0] * x[1] - h[1] * x[0] + 0.0
+        # Product of h x node, (-hx hz, -hy hz, hx^2 + hy^2), with x, divided by h.
+        across = np.where(size > 0, (level**2 * x[2] - h[2] * (h[0] * x[0] + h[1] * x[1])) / size, 0.0)
+        return np.where(flat, turns * (np.arctan2(x[1], x[0]) - Omega), np.arctan2(across, along))
+
+    position, pericentre = from_node(q), from_node(to_pericentre)
     f = position - pericentre
     M = _mean_anomaly(e, f, a, r, rv / np.sqrt(mu))
-    return {
-        "a": a,
-        "e": e,
-        "inc": inc,
-        "Omega": Omega % TURN,
-        "omega": pericentre % TURN,
-        "pomega": (Omega + turns * pericentre) % TURN,
-        "f": f % TURN,
-        "M": M,
-        "theta": (Omega + turns * position) % TURN,
-        "l": (Omega + turns * (pericentre + M)) % TURN,
-        "n": n,
-        "P": period,
+    angles = {
+        "Omega": Omega,
+        "omega": pericentre,
+        "pomega": Omega + turns * pericentre,
+        "f": f,
+        "theta": Omega + turns * position,
+        "l": Omega + turns * (pericentre + M),
     }
-
-
-def _in_plane(q: Any, momentum: Any, level: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the angle in the plane of the orbit from the ascending node to q; 0 if the node or q is undefined.
-
-    `level` is the length of the part (hx, hy) of the angular `momentum`, and `h` that of the whole.
-    """
-    hx, hy, hz = momentum
-    along = hx * q[1] - hy * q[0] + 0.0
-    # Product of h x node, (-hx hz, -hy hz, hx^2 + hy^2), with q, divided by h.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across = np.where(h > 0, (level**2 * q[2] - hz * (hx * q[0] + hy * q[1])) / h, 0.0)
-    return np.arctan2(across, along)
+    angles = {name: angle % TURN for name, angle in angles.items()}
+    return {"a": a, "e": e, "inc": inc, "M": M, "n": n, "P": TURN / n, **angles}
 
 
 def _mean_anomaly(e: np.ndarray, f: np.ndarray, a: np.ndarray, r: np.ndarray, rv: np.ndarray) -> np.ndarray:
     """Return the mean anomaly, between 0 and 2 pi for an ellipse, NaN for a parabola; `rv` is q . v / sqrt(mu)."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
-        nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))
-        anomaly = np.where(e < ROUND, nearly, np.arctan2(sine, cosine))
-        ellipse = (anomaly - sine) % TURN
-        hyperbola = sine - np.arcsinh(sine / e)
-    return np.where(np.isfinite(a), np.where(a > 0, ellipse, hyperbola), np.nan)
+    sine, cosine = rv / np.sqrt(np.abs(a)), 1 - r / a  # e times those of the eccentric anomaly
+    nearly = 2 * np.arctan2(np.sqrt(np.abs(1 - e)) * np.sin(f / 2), np.sqrt(1 + e) * np.cos(f / 2))
+    anomaly = np.where(e < ROUND, nearly, np.arctan2(sine, cosine))
+    hyperbola = sine - np.arcsinh(sine / e)
+    return np.where(np.isfinite(a), np.where(a > 0, (anomaly - sine) % TURN, hyperbola), np.nan)

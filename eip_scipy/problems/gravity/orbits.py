@@ -1,9 +1,9 @@
-"""Orbits of N bodies: energies, angular momenta and Laplace vectors as balances, see `Balance`, and frequencies."""
+"""Orbits of N bodies: energies, angular momenta and Laplace vectors as balances, see `Balance`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,37 +12,12 @@ from ...core.inputs import flag, real_array, shown
 from ...core.names import nearest
 from ...engine.native import library
 
-__all__ = [
-    "QUANTITIES",
-    "balances_of_orbits",
-    "centres",
-    "chosen_quantities",
-    "orbital_balances",
-    "orbital_frequencies",
-]
+__all__ = ["QUANTITIES", "balances_of_orbits", "centres", "orbital_balances"]
 
 Array = np.ndarray
-QUANTITIES = ("energy", "momentum", "laplace")
-# Least pericentre, in units of a pair's present distance: nearer, a radial orbit ends in a collision or is perturbed.
-LEAST_PERICENTRE = 1e-3
-# Least eccentricity of a pair whose time to the pericentre is considered, and halvings that solve Kepler's equation.
-LEAST_ECCENTRICITY, HALVINGS = 0.5, 30
-# Place of the energy at the start among the entries of an orbit, see engine/cpp/problems/orbits.cpp.
-ENERGY = 0
-
-
-class _Orbit(NamedTuple):
-    """Orbit of the body with the index `body`, or of this body together with those that move about it.
-
-    `entries` are its parameters for the library: the energy at the start (0 until it is known), the number of bodies
-    that take part, and the index of each and its weight in the relative position. A correction moves the `components`
-    (6, k) of the state by multiples of `weights` (6, k).
-    """
-
-    body: int
-    entries: Array
-    components: Array
-    weights: Array
+QUANTITIES = {"energy": ("",), "momentum": ("_x", "_y", "_z"), "laplace": ("_x", "_y", "_z")}
+"""Quantities of an orbit, with the ends of the names of their values."""
+KEPLER = {"kepler": "energy"}
 
 
 def orbital_balances(
@@ -101,19 +76,7 @@ def orbital_balances(
     >>> run.invariants.shape[0], run.trusted
     (9, True)
     """
-    return balances_of_orbits(gm, y0, quantities, bodies, newton, neutral=True)
-
-
-def balances_of_orbits(
-    gm: Any, y0: Any, quantities: Any, bodies: Sequence[str] | None, newton: bool, *, neutral: bool
-) -> tuple[Balance, ...]:
-    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged.
-
-    That moves all other bodies in the opposite direction. If the linear invariants of a run restore the centre of mass
-    by a common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
-    """
     masses, state = real_array("gm", gm), real_array("y0", y0)
-    newton = flag("newton", newton)
     if masses.ndim != 1 or masses.size < 2 or state.shape != (6 * masses.size,):
         raise ValueError(
             f"orbital_balances: gm has shape {masses.shape} and y0 {state.shape}; expected (N,) and (6 N,), N >= 2."
@@ -127,34 +90,71 @@ def balances_of_orbits(
         raise ValueError(
             f"bodies has {len(names)} names, but gm has {masses.size} masses; give one name for each mass."
         )
-    about = centres(masses, state)
-    orbits = [_orbit(masses, state, about, body, neutral) for body in np.flatnonzero(about >= 0).tolist()]
-    entries = np.concatenate([masses, *(orbit.entries for orbit in orbits)])
-    start = library["orbits.energy"](0.0, state, entries)
-    place = masses.size + ENERGY
-    for orbit, energy in zip(orbits, start.tolist(), strict=True):
-        entries[place] = energy
-        place += orbit.entries.size
-    end = "_rate_newton" if newton else "_rate"
+    return balances_of_orbits(masses, state, quantities, names, newton=flag("newton", newton), neutral=True)
+
+
+def balances_of_orbits(
+    gm: Array, y0: Array, quantities: Any, names: Sequence[str], *, newton: bool, neutral: bool
+) -> tuple[Balance, ...]:
+    """Return the balances of `orbital_balances`; if `neutral`, each correction leaves the centre of mass unchanged.
+
+    That moves all other bodies in the opposite direction. If the linear invariants of a run restore the centre of mass
+    by a common shift, which changes no orbit, only the body on an orbit about the heaviest body needs to move.
+
+    The library's parameters of an orbit are its energy at the start, the number of bodies that take part, and the index
+    of each and its weight in the relative position.
+    """
+    chosen, about = _chosen(quantities), centres(gm, y0)
+    families = _families(about)
+    orbits, entries, subspaces = np.flatnonzero(about >= 0).tolist(), [], []
+    for body in orbits:
+        centre, group = int(about[body]), families[body]
+        total = gm[group].sum()
+        shares = gm[group] / total if total > 0 else np.ones(1)
+        sides = np.column_stack([[centre, *group], [-1.0, *shares]])
+        entries.append(np.array([0.0, len(sides), *sides.ravel()]))
+        # The group moves, and the centre with the rest of its family in the opposite direction, so that their common
+        # centre of mass stays. No other orbit is then changed.
+        alone = not neutral and about[centre] < 0
+        moved = group if alone else families[centre]
+        moves = np.isin(moved, group) - (0.0 if alone else total / gm[moved].sum())
+        relative = [shares @ rows[group] - rows[centre] for rows in y0.reshape(2, -1, 3)]
+        lengths = np.linalg.norm(relative, axis=1)
+        lengths[lengths == 0] = 1.0
+        components = np.arange(y0.size).reshape(2, -1, 3)[:, moved].swapaxes(1, 2).reshape(6, -1)
+        subspaces.append((components, np.outer(np.repeat(lengths, 3), moves)))
+    start = library["orbits.energy"](0.0, y0, np.concatenate([gm, *entries]))
+    for entry, energy in zip(entries, start, strict=True):
+        entry[0] = energy
     # Planets of the first body have functions for many of them side by side.
     planets = about[0] < 0 and not about[1:].any()
-    own = {"energy": ("planets", np.concatenate([masses, start]))} if planets else {}
-    return tuple(
-        _balance(quantity, *own.get(quantity, ("orbits", entries)), orbits, names, end)
-        for quantity in chosen_quantities(quantities)
-    )
+    found = []
+    for quantity in chosen:
+        of_planets = planets and quantity == "energy"
+        params = np.concatenate([gm, start] if of_planets else [gm, *entries])
+        group_name, rate = "planets" if of_planets else "orbits", "_rate_newton" if newton else "_rate"
+        functions = (library[f"{group_name}.{quantity}{end}"].bound(params) for end in ("", rate, "_gradient"))
+        axes = QUANTITIES[quantity]
+        kept = Balance(*functions, size=len(axes) * len(orbits), name=quantity, in_place=True, uses_f=True)
+        # Neptune's energy changes at 0.05 of its terms, because the Sun is moved by Jupiter, and helps all the same.
+        kept.most_slowness = 0.2
+        kept.subspaces = tuple(subspace for subspace in subspaces for _ in axes)
+        kept.value_names = tuple(f"{quantity}{axis} of {names[body]}" for body in orbits for axis in axes)
+        found.append(kept)
+    return tuple(found)
 
 
-def chosen_quantities(given: Any) -> tuple[str, ...]:
+def _chosen(given: Any) -> list[str]:
     """Return the quantities that a name or several names mean, in the order of `QUANTITIES`; "kepler" is "energy"."""
-    names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else (given,)
+    names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    known = (*KEPLER, *QUANTITIES)
     for name in names:
-        if name not in (*QUANTITIES, "kepler"):
-            known = ", ".join(map(repr, ("kepler", *QUANTITIES)))
-            hint = nearest(str(name), ("kepler", *QUANTITIES))
-            raise ValueError(f"orbital_balances: unknown quantity {shown(name)}; known: {known}{hint}")
-    wanted = {"energy" if name == "kepler" else name for name in names}
-    return tuple(name for name in QUANTITIES if name in wanted)
+        if name not in known:
+            hint = nearest(str(name), known)
+            raise ValueError(
+                f"orbital_balances: unknown quantity {shown(name)}; known: {', '.join(map(repr, known))}{hint}"
+            )
+    return [name for name in QUANTITIES if name in {KEPLER.get(name, name) for name in names}]
 
 
 def centres(gm: Array, y0: Array) -> Array:
@@ -178,118 +178,12 @@ def centres(gm: Array, y0: Array) -> Array:
     return about
 
 
-def _is_below(about: Array, body: int, top: int) -> bool:
-    """Return True if `body` moves about `top`, directly or through other bodies; `about` is the array of `centres`."""
-    while body >= 0:
-        body = int(about[body])
-        if body == top:
-            return True
-    return False
-
-
-def _orbit(gm: Array, y0: Array, about: Array, body: int, neutral: bool) -> _Orbit:
-    """Return the orbit of `body`, together with all bodies that move about it, about the body ``about[body]``.
-
-    If `neutral`, or if it is not the heaviest body, the other side moves too, so that the centre of mass stays.
-    """
-    centre = int(about[body])
-    group = [k for k in range(gm.size) if k == body or _is_below(about, k, body)]
-    total = float(gm[group].sum())
-    shares = gm[group] / total if total > 0 else np.ones(1)
-    pairs = [(float(centre), -1.0), *((float(k), share) for k, share in zip(group, shares.tolist(), strict=True))]
-    q, v = y0.reshape(2, -1, 3)
-    sizes = [float(np.linalg.norm(shares @ a[group] - a[centre])) or 1.0 for a in (q, v)]
-    # The group moves, and the centre with the rest of what belongs to it moves in the opposite direction, so that their
-    # common centre of mass stays. No other orbit is then changed. A frame does the same for all bodies together.
-    by_itself = not neutral and about[centre] < 0
-    those = group if by_itself else [k for k in range(gm.size) if k == centre or _is_below(about, k, centre)]
-    floats = np.arange(y0.size).reshape(2, -1, 3)[:, those].swapaxes(1, 2).reshape(6, -1)
-    moves = np.isin(those, group) - (0.0 if by_itself else total / gm[those].sum())
-    entries = np.array([0.0, len(pairs), *np.ravel(pairs)])
-    return _Orbit(body, entries, floats, np.outer(np.repeat(sizes, 3), moves))
-
-
-def _balance(
-    quantity: str, group: str, entries: Array, orbits: list[_Orbit], names: tuple[str, ...], end: str
-) -> Balance:
-    """Return the balance of one quantity for all orbits, by the functions "group.quantity" of the library."""
-    fun, grad, rate = (library[f"{group}.{quantity}{part}"].bound(entries) for part in ("", "_gradient", end))
-    each = 1 if quantity == "energy" else 3
-    kept = Balance(fun, rate, grad, size=each * len(orbits), name=quantity, in_place=True, uses_f=True)
-    # Neptune's energy changes at 0.05 of its terms, because the Sun is moved by Jupiter, and helps all the same.
-    kept.most_slowness = 0.2
-    kept.subspaces = tuple((orbit.components, orbit.weights) for orbit in orbits for _ in range(each))
-    axes = ("",) if each == 1 else ("_x", "_y", "_z")
-    kept.value_names = tuple(f"{quantity}{axis} of {names[orbit.body]}" for orbit in orbits for axis in axes)
-    return kept
-
-
-def orbital_frequencies(gm: np.ndarray, y: np.ndarray, duration: float = np.inf) -> tuple[np.ndarray, float]:
-    """Return an angular frequency for each orbit about the heaviest body, and the largest one of the other pairs.
-
-    `gm` (N,) are G times the masses, `y` (6 N,) positions and velocities, and `duration` is the length of the run,
-    negative if it goes back in time. The frequencies (N,) are in radians per unit of time, 0 for the heaviest body. The
-    other pairs are those, such as a planet and its moon, for which the sum of both G m divided by the cube of the
-    distance is larger than it is for the heaviest body and one body of the pair; without such pairs the second result
-    is 0.
-
-    The frequency of a bound pair is computed from its osculating orbit. It is the geometric mean of the mean motion n
-    and the frequency in the pericentre, n (1 - e)^(-3/2), because this mean determines the stability of a multistep
-    method, as was measured with Mercury (e = 0.2). If the eccentricity of a bound pair is above 0.5, and the pair does
-    not reach its pericentre within the run, its least distance within the run takes the place of the pericentre. If
-    other bodies change the motion of a pair more than its own attraction does, or if the pair flies apart for good, the
-    frequency is that of its attraction at the present distance. Therefore the frequency of a pair without angular
-    momentum is finite.
-    """
-    n, centre = len(gm), int(np.argmax(gm))
-    pulls = np.empty_like(y)
-    library["gravity.rhs"](0.0, y, pulls, gm)
-    q, v, a = y[: 3 * n].reshape(n, 3), y[3 * n :].reshape(n, 3), pulls[3 * n :].reshape(n, 3)
-    with np.errstate(all="ignore"):  # of a body and itself, and of massless pairs
-        about = _pair_frequencies(gm + gm[centre], q - q[centre], v - v[centre], a - a[centre], duration)
-        others = 0.0
-        to_centre = (gm + gm[centre]) / np.linalg.norm(q - q[centre], axis=1) ** 3
-        for i in range(n):
-            near = (gm + gm[i]) / np.linalg.norm(q - q[i], axis=1) ** 3 > to_centre
-            near[[i, centre]] = False
-            if i != centre and near.any():
-                pairs = q[near] - q[i], v[near] - v[i], a[near] - a[i]
-                others = max(others, _pair_frequencies(gm[near] + gm[i], *pairs, duration).max())
-    about[centre] = 0.0
-    return about, float(others)
-
-
-def _pair_frequencies(mass: Array, r: Array, u: Array, pull: Array, duration: float) -> Array:
-    """Return the frequencies (k,) of pairs of this `mass`, with relative positions, velocities and pulls (k, 3)."""
-    distance, along = np.linalg.norm(r, axis=1), np.sum(r * u, axis=1)
-    own = mass / distance**3
-    inverse_axis = 2.0 / distance - np.sum(u * u, axis=1) / mass
-    momentum = np.sum(np.cross(r, u) ** 2, axis=1) / mass
-    eccentricity = np.sqrt(np.maximum(0.0, 1.0 - momentum * inverse_axis))
-    pericentre = np.maximum(momentum / (1.0 + eccentricity), LEAST_PERICENTRE * distance)
-    approaches = along * np.copysign(1.0, duration) < 0.0
-    least = _nearest(mass, distance, inverse_axis, eccentricity, approaches, abs(duration))
-    fastest = np.sqrt(mass / np.maximum(pericentre, least) ** 3)
-    mean = np.sqrt(mass * np.maximum(inverse_axis, 0.0) ** 3)
-    alone = np.linalg.norm(pull + own[:, None] * r, axis=1) < mass / distance**2
-    bound = inverse_axis > 0.0
-    of_orbit = np.where(bound, np.sqrt(mean * fastest), fastest)
-    found = np.where(alone & (bound | ~(along > 0.0)), of_orbit, np.sqrt(own))
-    return np.where((mass > 0.0) & ~np.isnan(found), found, 0.0)
-
-
-def _nearest(mass: Array, distance: Array, inverse_axis: Array, e: Array, approaches: Array, duration: float) -> Array:
-    """Return the least distances (k,) in the run of bound pairs whose pericentre comes after its end, 0 for others."""
-    a = 1.0 / inverse_axis
-    anomaly = np.arccos(np.clip((1.0 - distance / a) / e, -1.0, 1.0))
-    until = anomaly - e * np.sin(anomaly)  # the mean anomaly left
-    left = np.where(approaches, until, 2 * np.pi - until) - duration * np.sqrt(mass / a**3)
-    wanted = np.minimum(left, 2 * np.pi - left)  # the same distance before and after the apocentre
-    low, high = np.zeros_like(a), np.full_like(a, np.pi)
-    for _ in range(HALVINGS):  # of Kepler's equation
-        middle = 0.5 * (low + high)
-        below = middle - e * np.sin(middle) < wanted
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    # Circles have no pericentre to wait for.
-    later = (inverse_axis > 0.0) & (e > LEAST_ECCENTRICITY) & (left > 0.0)
-    return np.where(later, np.minimum(distance, a * (1.0 - e * np.cos(low))), 0.0)
+def _families(about: Array) -> list[list[int]]:
+    """Return for each body the indices, in order, of the body and of all that move about it, directly or not."""
+    found: list[list[int]] = [[] for _ in about]
+    for body in range(about.size):
+        above = body
+        while above >= 0:
+            found[above].append(body)
+            above = int(about[above])
+    return found

@@ -1,33 +1,22 @@
-"""Initial data and reference states of the solar system that are contained in the package.
+"""Initial data of the solar system: sets in the package, in AU and days.
 
-The package contains four sets: ``"de440"``, the Sun and the nine system barycentres of JPL's DE440 at
-2014-02-02 20:18:00 TDB, the epoch of Cai, Gong and Wang; ``"de440-j2000"``, the same bodies at JD 2451545.0 TDB;
-``"de440-moon"``, the first set with Earth and Moon in place of their barycentre; and ``"paper"``, the table in
-Appendix A of Cai, Gong and Wang. `eip_scipy.integrations.jpl.initial_data` returns data for any other epoch.
+`eip_scipy.integrations.jpl.initial_data` returns data for any other epoch.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
+from ...data import read
+
 __all__ = [
-    "AU_KM",
-    "DAY_S",
-    "YEAR_D",
-    "SolarSystemData",
-    "available",
-    "exact_sum",
-    "gm_from_km3_s2",
-    "load",
-    "reference_states",
-    "to_barycentre",
-]
+    "AU_KM", "DAY_S", "YEAR_D", "SolarSystemData", "available", "exact_sum", "gm_from_km3_s2", "load",
+    "reference_states", "to_barycentre",
+]  # fmt: skip
 
 AU_KM = 149597870.7
 """The astronomical unit in km (IAU 2012, exact)."""
@@ -37,7 +26,6 @@ YEAR_D = 365.25
 """The Julian year in days."""
 
 SOLAR_SYSTEM_JSON = "solar_system.json"
-_REFERENCE_JSON = "solar_reference.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,29 +34,23 @@ class SolarSystemData:
 
     Attributes
     ----------
-    name : str
-        Name of the set.
+    name, source : str
+        Name of the set and source of the numbers.
     bodies : tuple of str
         Names of the N bodies, the Sun first.
     gm : ndarray, shape (N,)
         Masses times the constant of gravitation, in AU^3/day^2.
-    position : ndarray, shape (N, 3)
-        Positions in AU.
-    velocity : ndarray, shape (N, 3)
-        Velocities in AU/day.
-    epoch_jd_tdb : float
-        Epoch as a Julian date in TDB. A float64 resolves 40 microseconds; the states belong to the exact epoch, which
-        is `epoch_jd_tdb` + `epoch_rest`.
+    position, velocity : ndarray, shape (N, 3)
+        In AU and AU/day.
+    epoch_jd_tdb, epoch_rest : float
+        Epoch as a Julian date in TDB, and the part of the exact epoch, in days, that rounding removes from it: a
+        float64 resolves 40 microseconds.
     epoch : str
         The epoch as a date of the (proleptic) Gregorian calendar.
     axes : str
         Axes of the positions and velocities: "ICRF" or "ecliptic J2000".
-    source : str
-        Source of the numbers.
     units : str
         Units of length and time of the arrays: "AU, day".
-    epoch_rest : float
-        The part of the exact epoch, in days, that rounding removes from `epoch_jd_tdb`.
     """
 
     name: str
@@ -87,13 +69,6 @@ class SolarSystemData:
     def y0(self) -> np.ndarray:
         """The state (q of all bodies, v of all bodies), shape (6 N,)."""
         return np.concatenate([self.position.ravel(), self.velocity.ravel()])
-
-
-def exact_sum(a: float, b: float) -> tuple[float, float]:
-    """Return the rounded sum of a and b, and the exact sum minus the rounded one."""
-    total = a + b
-    part = total - a
-    return total, (a - (total - part)) + (b - part)
 
 
 def available() -> tuple[str, ...]:
@@ -134,44 +109,35 @@ def load(name: str = "de440", *, as_printed: bool = False) -> SolarSystemData:
     """
     sets = read(SOLAR_SYSTEM_JSON)
     if name not in sets:
-        raise ValueError(_unknown(name, tuple(sets)))
+        raise ValueError(f"unknown solar system data {name!r}; available: {', '.join(map(repr, sets))}")
     if as_printed and name != "paper":
         raise ValueError(f"as_printed=True is an option of the set 'paper' only, got name={name!r}; omit it")
     entry = sets[name]
-    gm, position, velocity = _with_sun(entry, as_printed) if name == "paper" else _arrays(entry)
+    bodies = tuple(entry["bodies"])
+    gm, position, velocity = (np.array(entry[key], dtype=float) for key in ("gm", "position", "velocity"))
+    if name == "paper":  # in m and s, without the Sun
+        if not as_printed:
+            misprint = entry["misprint"]
+            velocity[bodies.index(misprint["body"]), "xyz".index(misprint["component"])] = float(misprint["corrected"])
+        bodies = ("Sun", *bodies)
+        gm = gm_from_km3_s2(np.insert(gm, 0, float(entry["gm_sun"])) / 1e9)
+        position = np.insert(position / 1e3 / AU_KM, 0, 0.0, axis=0)
+        velocity = np.insert(velocity / 1e3 * DAY_S / AU_KM, 0, 0.0, axis=0)
+        position, velocity = to_barycentre(gm, position, velocity)
     epoch, rest = exact_sum(*entry["epoch_jd_tdb"])
     return SolarSystemData(
-        name=name,
-        bodies=("Sun", *entry["bodies"]) if name == "paper" else tuple(entry["bodies"]),
-        gm=gm,
-        position=position,
-        velocity=velocity,
-        epoch_jd_tdb=epoch,
-        epoch=entry["epoch"],
-        axes=entry["axes"],
-        source=entry["source"],
-        epoch_rest=rest,
+        name, bodies, gm, position, velocity, epoch, entry["epoch"], entry["axes"], entry["source"], epoch_rest=rest
     )
 
 
 def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
-    """Return accurate states of the Newtonian ten-body problem ``solar_system("de440")``.
-
-    Parameters
-    ----------
-    name : {"de440"}
-        Name of the data set from which the states start.
+    """Return accurate states of the Newtonian ten-body problem ``solar_system("de440")``; `name` must be "de440".
 
     Returns
     -------
     dict of float to ndarray, shape (60,)
         The states (q of all bodies, v of all bodies) in AU and AU/day, on the axes of ``load("de440")``, by the time
         since the epoch in Julian years (1, 2, 5, 10 and so on to 10 000).
-
-    Raises
-    ------
-    ValueError
-        If there are no reference states for this data set.
 
     Notes
     -----
@@ -181,11 +147,8 @@ def reference_states(name: str = "de440") -> dict[float, np.ndarray]:
     differently, which changes the position of Mercury by 2e-11 AU after this time.
     """
     if name != "de440":
-        known = available()
-        raise ValueError(
-            f"reference states exist for 'de440' only, got {name!r}" if name in known else _unknown(name, known)
-        )
-    states = {float(year): np.array(y, dtype=float) for year, y in read(_REFERENCE_JSON)["states"].items()}
+        raise ValueError(f"reference states exist for 'de440' only, got {name!r}; available: 'de440'")
+    states = {float(year): np.array(y, dtype=float) for year, y in read("solar_reference.json")["states"].items()}
     for y in states.values():
         y[y.size // 2 :] /= YEAR_D
     return states
@@ -197,53 +160,17 @@ def gm_from_km3_s2(gm: Any) -> np.ndarray:
 
 
 def to_barycentre(gm: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions and velocities relative to the centre of mass.
+    """Return positions and velocities (N, 3) relative to the centre of mass of N bodies, in any units."""
 
-    Parameters
-    ----------
-    gm : ndarray, shape (N,)
-        Masses, in any unit.
-    position, velocity : ndarray, shape (N, 3)
-        Positions and velocities, in any units.
+    def centre(rows: np.ndarray) -> np.ndarray:
+        # fsum and no matrix product: the sum must not depend on the order in which some BLAS adds.
+        return np.array([math.fsum(gm * column) for column in rows.T]) / math.fsum(gm)
 
-    Returns
-    -------
-    position, velocity : ndarray, shape (N, 3)
-        New arrays whose centre of mass rests at the origin, to the rounding of their elements.
-    """
-    return position - _centre(gm, position), velocity - _centre(gm, velocity)
+    return position - centre(position), velocity - centre(velocity)
 
 
-def _centre(gm: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    # fsum and no matrix product: the sum must not depend on the order in which some BLAS adds.
-    return np.array([math.fsum(gm * column) for column in rows.T]) / math.fsum(gm)
-
-
-_Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-def _arrays(entry: dict[str, Any]) -> _Arrays:
-    gm, position, velocity = (np.array(entry[key], dtype=float) for key in ("gm", "position", "velocity"))
-    return gm, position, velocity
-
-
-def _with_sun(entry: dict[str, Any], as_printed: bool) -> _Arrays:
-    """Return G m, positions and velocities of the paper's table in AU and days, with the Sun added as first body."""
-    gm, position, velocity = _arrays(entry)
-    if not as_printed:
-        misprint = entry["misprint"]
-        row = entry["bodies"].index(misprint["body"])
-        velocity[row, "xyz".index(misprint["component"])] = float(misprint["corrected"])
-    gm = gm_from_km3_s2(np.insert(gm, 0, float(entry["gm_sun"])) / 1e9)
-    position = np.insert(position / 1e3 / AU_KM, 0, 0.0, axis=0)
-    velocity = np.insert(velocity / 1e3 * DAY_S / AU_KM, 0, 0.0, axis=0)
-    return gm, *to_barycentre(gm, position, velocity)
-
-
-def read(file: str) -> dict[str, Any]:
-    """Return the content of a JSON file of the package's data."""
-    return json.loads(files("eip_scipy.data").joinpath(file).read_text(encoding="utf-8"))
-
-
-def _unknown(name: object, known: tuple[str, ...]) -> str:
-    return f"unknown solar system data {name!r}; available: {', '.join(map(repr, known))}"
+def exact_sum(a: float, b: float) -> tuple[float, float]:
+    """Return the rounded sum of a and b, and the exact sum minus the rounded one."""
+    total = a + b
+    part = total - a
+    return total, (a - (total - part)) + (b - part)

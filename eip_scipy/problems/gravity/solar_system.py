@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import partial
+from math import cos, radians, sin
 
 import numpy as np
 
@@ -15,14 +15,16 @@ from .solar_data import AU_KM, DAY_S, YEAR_D, SolarSystemData, load, reference_s
 
 __all__ = ["solar_system"]
 
-UNITS = ("AU, yr", "SI")
+# The AU in the unit of length and the day in the unit of time, and the name of the units.
+UNITS = {"AU, yr": (1.0, 1.0 / YEAR_D, "AU, Julian year"), "SI": (AU_KM * 1e3, DAY_S, "m, s")}
 
 C_KM_S = 299792.458
 # DE440: comments of the kernel. The Sun's pole: IAU Working Group on Cartographic Coordinates (2015), ICRF.
 J2_SUN, SUN_RADIUS_KM, EARTH_OVER_MOON = 2.1961391516529825e-07, 696000.0, 81.300568221497215
-POLE_RA_DEG, POLE_DEC_DEG = 286.13, 63.87
+POLE_RA, POLE_DEC = radians(286.13), radians(63.87)
+POLE = cos(POLE_DEC) * cos(POLE_RA), cos(POLE_DEC) * sin(POLE_RA), sin(POLE_DEC)
 MOON_ORBIT_KM = 384399.0
-OBLIQUITY_ARCSEC = 84381.448  # IAU 1976, of the axes "ecliptic J2000"
+OBLIQUITY = radians(84381.448 / 3600)  # IAU 1976, of the axes "ecliptic J2000"
 
 
 def solar_system(
@@ -72,11 +74,17 @@ def solar_system(
     chosen = check_forces(forces)
     if "drag" in chosen:
         raise ValueError("solar_system: the force 'drag' needs an atmosphere; see satellite(...), or nbody(...).")
-    length, time = _units(units)
+    if "moon-quadrupole" in chosen and "EMB" not in known.bodies:
+        raise ValueError(
+            f"the force 'moon-quadrupole' replaces the Moon in data that contain the Earth-Moon barycentre EMB; "
+            f"{known.name!r} does not contain it. Omit this force, or use 'de440'."
+        )
+    if not isinstance(units, str) or units not in UNITS:
+        raise ValueError(f"units must be one of {tuple(UNITS)}, got {units!r}.")
+    length, time, name = UNITS[units]
     year = YEAR_D * time
     start = load("de440")  # from which the stored references start; names do not determine epochs
     is_start = np.array_equal(known.gm, start.gm) and np.array_equal(known.y0, start.y0)
-    references = reference_states() if is_start and not chosen else {}
     return nbody(
         known.gm * (length**3 / time**2),
         known.position * length,
@@ -85,11 +93,11 @@ def solar_system(
         h=h * year,
         forces=chosen,
         balances=balances,
-        constants=_constants(known, chosen, length, time) if chosen else None,
+        constants=_constants(known, length, time),
         name="solar-system",
-        units="AU, Julian year" if units == "AU, yr" else "m, s",
+        units=name,
         source=known.source,
-        reference=partial(_reference, references, length, time),
+        reference=partial(_reference, reference_states() if is_start and not chosen else {}, length, time),
         bodies=known.bodies,
         epoch=(known.epoch_jd_tdb, known.epoch_rest),
     )
@@ -97,43 +105,16 @@ def solar_system(
 
 def _reference(references: dict[float, np.ndarray], length: float, time: float, t: float) -> np.ndarray | None:
     state = references.get(round(t / (YEAR_D * time), 9))
-    if state is None:
-        return None
-    half = state.size // 2
-    return np.concatenate([state[:half] * length, state[half:] * (length / time)])
+    return None if state is None else state * np.repeat([length, length / time], state.size // 2)
 
 
-def _constants(data: SolarSystemData, forces: tuple[str, ...], length: float, time: float) -> ForceConstants:
+def _constants(data: SolarSystemData, length: float, time: float) -> ForceConstants:
     """Return the constants of the forces in units in which the AU is `length` and the day is `time`."""
-    km = length / AU_KM
-    if "moon-quadrupole" in forces and "EMB" not in data.bodies:
-        raise ValueError(
-            f"the force 'moon-quadrupole' replaces the Moon in data that contain the Earth-Moon barycentre EMB; "
-            f"{data.name!r} does not contain it. Omit this force, or use 'de440'."
-        )
+    km, (x, y, z), c, s = length / AU_KM, POLE, cos(OBLIQUITY), sin(OBLIQUITY)
     return ForceConstants(
         c=C_KM_S * DAY_S * km / time,
         j2=J2_SUN * (SUN_RADIUS_KM * km) ** 2,
-        pole=_pole(data.axes),
+        pole=POLE if data.axes == "ICRF" else (x, c * y + s * z, c * z - s * y),
         moon_body=data.bodies.index("EMB") if "EMB" in data.bodies else None,
         moon=(MOON_ORBIT_KM * km / (1 + EARTH_OVER_MOON)) ** 2 * EARTH_OVER_MOON / 4,
     )
-
-
-def _pole(axes: str) -> tuple[float, float, float]:
-    """Return the unit vector to the Sun's north pole on the axes "ICRF" or "ecliptic J2000"."""
-    ra, dec = math.radians(POLE_RA_DEG), math.radians(POLE_DEC_DEG)
-    x, y, z = math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)
-    if axes == "ICRF":
-        return x, y, z
-    c, s = math.cos(math.radians(OBLIQUITY_ARCSEC / 3600)), math.sin(math.radians(OBLIQUITY_ARCSEC / 3600))
-    return x, c * y + s * z, c * z - s * y
-
-
-def _units(units: str) -> tuple[float, float]:
-    """Return the AU in the unit of length and the day in the unit of time of `units`."""
-    if units == "AU, yr":
-        return 1.0, 1.0 / YEAR_D
-    if units == "SI":
-        return AU_KM * 1e3, DAY_S
-    raise ValueError(f"units must be one of {UNITS}, got {units!r}.")

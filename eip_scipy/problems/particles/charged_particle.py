@@ -1,15 +1,10 @@
-"""Charged particles in electromagnetic fields: Experiment III of "the paper", and user-defined fields.
-
-The paper is Cai, Gong & Wang.
-"""
+"""Charged particles in electromagnetic fields, and the two of Experiment III of Cai, Gong & Wang."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from functools import cache, partial
-from importlib.resources import files
-from math import inf, pi
+from functools import partial
+from math import pi
 from typing import Any
 
 import numpy as np
@@ -19,8 +14,9 @@ from ...core.inputs import real_array
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import Problem, bind
-from ._equations import CHARGE, MASS, ParticleEquations, compose
+from ...data import stored
 from .fields import TOKAMAK, UNIFORM, ParticleField
+from .motion import CHARGE, MASS, Motion, motion
 
 __all__ = ["ORBITS", "ParticleProblem", "charged_particle", "tokamak", "uniform_field"]
 
@@ -50,19 +46,17 @@ class ParticleProblem(Problem):
     @property
     def parameters(self) -> dict[str, float]:
         """Values of the parameters by name."""
-        return {"mass": self.mass, "charge": self.charge}
+        return dict(zip(("mass", "charge"), np.asarray(self.params).tolist(), strict=True))
 
     @property
     def mass(self) -> float:
         """The particle's mass."""
-        assert self.params is not None
-        return float(self.params[MASS])
+        return self.parameters["mass"]
 
     @property
     def charge(self) -> float:
         """The particle's charge."""
-        assert self.params is not None
-        return float(self.params[CHARGE])
+        return self.parameters["charge"]
 
     def velocity(self, y: Any) -> np.ndarray:
         """Return the velocities (3, m) of states (6, m): (p - q A(x)) / m in the canonical form."""
@@ -121,11 +115,6 @@ def charged_particle(
         If an argument is wrong, the canonical form has a field without A, or functions of the field are not finite or
         contradict each other at the start.
 
-    Notes
-    -----
-    The energy's gradient needs no evaluation of the field beyond that of the equations: in the canonical form it is
-    (-p', x'), in the other (-q E, m v).
-
     Examples
     --------
     A magnetic mirror with B_z = 1 + z^2 on the axis, defined by its vector potential alone:
@@ -156,21 +145,22 @@ def charged_particle(
         raise ValueError(f"charged_particle: balances must be 'energy', 'kinetic' or None, got {balances!r}{hint}")
     x, v = _vector("position", position), _vector("velocity", velocity)
     params = np.array([mass, charge], dtype=float)
-    if not (0 < params[MASS] < inf and params[CHARGE] != 0 and np.isfinite(params[CHARGE])):
+    if not (params[MASS] > 0 and params[CHARGE] != 0 and np.isfinite(params).all()):
         raise ValueError(
             f"charged_particle: mass must be positive and charge not 0, both finite; got {mass!r} and {charge!r}."
         )
-    field.check(x, float(t_span[0]))
-    equations = compose(field.functions, form)
+    t0, t_end = map(float, t_span)
+    field.check(x, t0)
+    of_field = motion(field.functions, form)
     momentum = v if form == "velocity" else params[MASS] * v + params[CHARGE] * field.along("A", x[:, None])[:, 0]
     return ParticleProblem(
-        fun=bind(equations.rhs, params),
-        rhs=equations.rhs,
+        fun=bind(of_field.rhs, params),
+        rhs=of_field.rhs,
         y0=np.concatenate([x, momentum]),
-        t_span=(float(t_span[0]), float(t_span[1])),
+        t_span=(t0, t_end),
         h=h,
         params=params,
-        invariants=_invariants(equations, field, form, params, balances),
+        invariants=_invariants(of_field, field, form, params, balances),
         blocks=3,
         component_names=("x", "y", "z", *(("vx", "vy", "vz") if form == "velocity" else ("px", "py", "pz"))),
         field=field,
@@ -179,30 +169,28 @@ def charged_particle(
     )
 
 
-def _invariants(
-    equations: ParticleEquations, field: ParticleField, form: str, params: np.ndarray, balances: str | None
-) -> tuple[Invariant, ...]:
-    found: list[Invariant] = []
-    energy, momentum, args = equations.energy, equations.momentum, (params,)
-    if balances == "energy" and field.varies and energy is not None:
-        found.append(Balance(energy, args=args, name="H"))
-    elif balances is not None:
-        kinetic, gradient, power = equations.kinetic, equations.kinetic_gradient, equations.power
-        assert kinetic is not None
-        found.append(Balance(kinetic, power, gradient, args=args, in_place=True, name="T"))
-    elif energy is not None and not field.varies:
-        uses_f = form == "canonical"
-        found.append(Invariant(energy, equations.energy_gradient, args=args, in_place=True, uses_f=uses_f, name="H"))
-    if field.axisymmetric and momentum is not None:
-        found.append(Invariant(momentum, equations.momentum_gradient, args=args, in_place=True, name="L"))
-    return tuple(found)
-
-
 def _vector(name: str, value: Any) -> np.ndarray:
     vector = real_array(name, value)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"charged_particle: {name} must be three finite numbers, got {value!r}.")
     return vector
+
+
+def _invariants(
+    of_field: Motion, field: ParticleField, form: str, params: np.ndarray, balances: str | None
+) -> tuple[Invariant, ...]:
+    energy, momentum = of_field.energy, of_field.momentum
+    given: dict[str, Any] = {"args": (params,), "in_place": True}
+    found: list[Invariant] = []
+    if balances == "energy" and field.varies and energy:
+        found.append(Balance(energy[0], args=(params,), name="H"))
+    elif balances is not None and of_field.kinetic:
+        found.append(Balance(*of_field.kinetic, **given, name="T"))
+    elif energy and not field.varies:
+        found.append(Invariant(*energy, **given, uses_f=form == "canonical", name="H"))
+    if field.axisymmetric and momentum:
+        found.append(Invariant(*momentum, **given, name="L"))
+    return tuple(found)
 
 
 def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STEP, h: float = STEP) -> ParticleProblem:
@@ -222,7 +210,7 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
     ParticleProblem
         With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
     """
-    return _paper("uniform", UNIFORM, [0.0, -1.0, 0.0], [0.1, 0.01, 0.0], form, t_end, h)
+    return _of_paper("uniform", UNIFORM, ([0.0, -1.0, 0.0], [0.1, 0.01, 0.0]), form, t_end, h)
 
 
 def tokamak(
@@ -234,10 +222,8 @@ def tokamak(
     ----------
     orbit : {"banana", "transit"}, optional
         The trapped ("banana") or the passing ("transit") orbit.
-    form : {"canonical", "velocity"}, optional
-        The state: (x, p), as in the paper, or (x, v).
-    t_end, h : float, optional
-        End of the interval that starts at 0, and a step; the defaults are the paper's, 500 000 steps of pi / 10.
+    form, t_end, h : optional
+        See `uniform_field`; the paper's interval has 500 000 steps of pi / 10.
 
     Returns
     -------
@@ -246,17 +232,16 @@ def tokamak(
     """
     if orbit not in ORBITS:
         raise ValueError(f"tokamak: orbit must be one of {', '.join(ORBITS)}, got {orbit!r}{nearest(orbit, ORBITS)}")
-    velocity = [0.0, ORBITS[orbit] * 4.816e-4, -2.059e-3]
-    return _paper(f"tokamak-{orbit}", TOKAMAK, [1.05, 0.0, 0.0], velocity, form, t_end, h)
+    start = [1.05, 0.0, 0.0], [0.0, ORBITS[orbit] * 4.816e-4, -2.059e-3]
+    return _of_paper(f"tokamak-{orbit}", TOKAMAK, start, form, t_end, h)
 
 
-def _paper(
-    name: str, field: ParticleField, position: list[float], velocity: list[float], form: str, t_end: float, h: float
+def _of_paper(
+    name: str, field: ParticleField, start: tuple[list[float], list[float]], form: str, t_end: float, h: float
 ) -> ParticleProblem:
     return charged_particle(
         field,
-        position,
-        velocity,
+        *start,
         t_span=(0.0, t_end),
         h=h,
         form=form,
@@ -269,14 +254,5 @@ def _paper(
 
 def _reference(name: str, form: str, t: float) -> np.ndarray | None:
     """Return the stored state of the problem `name` at the time `t`, in the given form; None if there is none."""
-    for row in _references()[name]:
-        if abs(t - row["t"]) <= 1e-14 * row["t"]:
-            return np.array(row["position"] + row["momentum" if form == "canonical" else "velocity"])
-    return None
-
-
-@cache
-def _references() -> dict[str, list[dict[str, Any]]]:
-    text = files("eip_scipy.data").joinpath("particle_references.json").read_text(encoding="utf-8")
-    states: dict[str, list[dict[str, Any]]] = json.loads(text)["states"]
-    return states
+    row = stored("particle_references.json", name, t)
+    return None if row is None else np.array(row["position"] + row["momentum" if form == "canonical" else "velocity"])

@@ -4,29 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from math import isfinite, log, log2, sqrt
 from typing import Any
 
 import numpy as np
 
-from ...core.functions import compilable, jitted, own_values
-from ._equations import (
-    FieldFunctions,
-    at_any_time,
-    curl,
-    difference_force,
-    difference_jacobian,
-    jit_like,
-    no_force,
-    no_potential,
-)
+from ...core.derivatives import DIFFERENCE_WEIGHTS
+from ...core.functions import compilable, compiled_like, jitted, own_values
+from .motion import FieldFunctions, Function, no_force, no_potential
 
 __all__ = ["TOKAMAK", "UNIFORM", "ParticleField"]
 
 DIFFERENCE_STEP = 2.0**-7  # step of differences, in units of `length`
 AGREEMENT = 1e-6  # largest relative difference of functions that must agree
 ROUND_OFF = 1e-10  # bound for the rounding of a difference whose true value is 0
+SHAPES = {"vector_potential": (3,), "jacobian": (3, 3), "potential": (), "electric": (3,), "magnetic": (3,)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +51,6 @@ class ParticleField:
         A length over which the field changes by some tens of per cent, in the unit of the positions. It determines the
         step of the differences. The default does not fit positions in metres in the field of a planet or a star, or
         in a trap of micrometres.
-    name : str
 
     Notes
     -----
@@ -74,10 +66,9 @@ class ParticleField:
     axisymmetric: bool = False
     varies: bool = False
     length: float = 1.0
-    name: str = "field"
 
     def __post_init__(self) -> None:
-        for key in ("vector_potential", "jacobian", "potential", "electric", "magnetic"):
+        for key in SHAPES:
             given = getattr(self, key)
             if not (given is None or callable(given)):
                 raise TypeError(f"ParticleField: {key} must be a function of (x, y, z) or None, got {given!r}.")
@@ -90,95 +81,124 @@ class ParticleField:
         if not (self.length > 0 and isfinite(self.length)):
             raise ValueError(f"ParticleField: length must be positive and finite, got {self.length!r}.")
 
-    @property
-    def _step(self) -> float:
-        # A power of two, so that adding it to a position causes almost no rounding.
-        return float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
-
     @cached_property
     def functions(self) -> FieldFunctions:
         """Return all functions of the field; those that were not given are computed from the others if possible."""
-        step = self._step
-        given = self.vector_potential, self.jacobian, self.potential, self.electric, self.magnetic
-        own = (None if fun is None else own_values(jitted(fun)) for fun in given)
-        A, jacobian, phi, E, B = (fun if fun is None or self.varies else at_any_time(fun) for fun in own)
+        A, jacobian, phi, E, B = (self._of_time(jitted(getattr(self, key))) for key in SHAPES)
         if A is not None and jacobian is None:
-            jacobian = difference_jacobian(A, step)
+            jacobian = self._derivatives(A)
         if E is None and phi is None:
-            E, phi = jit_like(no_force, A, B), jit_like(no_potential, A, B)
+            E, phi = (compiled_like(fun, *filter(None, (A, B))) for fun in (no_force, no_potential))
         if E is None:
-            assert phi is not None
-            E = difference_force(phi, step)
-        if B is None:
-            assert jacobian is not None
-            B = curl(jacobian)
-        return FieldFunctions(A, jacobian, phi, E, B)
+            E = _force(self._derivatives(_as_vector(phi)))
+        return FieldFunctions(A, jacobian, phi, E, _curl(jacobian) if B is None else B)
 
     @cached_property
     def fill(self) -> Callable[..., None]:
-        """Return ``fill(t, x, out)``, which writes E to out[:3] and B to out[3:], for the Boris pusher."""
+        """Return ``fill(t, x, out)``, which writes E to out[:3] and B to out[3:], for methods such as Boris's."""
         E, B = self.functions.E, self.functions.B
 
-        def fields(t: float, x: np.ndarray, out: np.ndarray) -> None:
-            e = E(t, x[0], x[1], x[2])
-            b = B(t, x[0], x[1], x[2])
-            out[0] = e[0]
-            out[1] = e[1]
-            out[2] = e[2]
-            out[3] = b[0]
-            out[4] = b[1]
-            out[5] = b[2]
+        def fields(t, x, out):
+            e, b = E(t, x[0], x[1], x[2]), B(t, x[0], x[1], x[2])
+            out[0], out[1], out[2], out[3], out[4], out[5] = e[0], e[1], e[2], b[0], b[1], b[2]
 
-        return jit_like(fields, E, B)
+        return compiled_like(fields, E, B)
 
-    def _plain(self, key: str) -> Callable[..., Any]:
-        """Return the given function in the attribute `key` as an interpreted function of (t, x, y, z)."""
-        fun = getattr(self, key)
-        return own_values((lambda *where: fun(*where)) if self.varies else (lambda t, *where: fun(*where)))
+    def _of_time(self, fun: Any) -> Any:
+        """Return a given function, or None, as a function of (t, x, y, z)."""
+        if fun is None:
+            return None
+        own = own_values(fun)
+        return own if self.varies else compiled_like(lambda t, x, y, z: own(x, y, z), own)
+
+    def _derivatives(self, A: Function) -> Function:
+        """Return a function of the rows dA_i/dx_j, computed by central differences of order 6."""
+        # A power of two, so that adding it to a position causes almost no rounding.
+        step = float(2.0 ** round(log2(DIFFERENCE_STEP * self.length)))
+
+        def along(t, x, y, z, dx, dy, dz):
+            d0 = d1 = d2 = 0.0
+            for k, weight in DIFFERENCE_WEIGHTS:
+                right = A(t, x + k * dx, y + k * dy, z + k * dz)
+                left = A(t, x - k * dx, y - k * dy, z - k * dz)
+                d0 += weight * (right[0] - left[0])
+                d1 += weight * (right[1] - left[1])
+                d2 += weight * (right[2] - left[2])
+            return d0 / step, d1 / step, d2 / step
+
+        along = compiled_like(along, A)
+
+        def rows(t, x, y, z):
+            a = along(t, x, y, z, step, 0.0, 0.0)
+            b = along(t, x, y, z, 0.0, step, 0.0)
+            c = along(t, x, y, z, 0.0, 0.0, step)
+            return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
+
+        return compiled_like(rows, A)
 
     def check(self, position: np.ndarray, t: float = 0.0) -> None:
         """Raise ValueError if functions return wrong numbers of values, or contradict each other, at a point (3,)."""
-        step, where = self._step, (t, *position)
-        found = {key: self._value(key, shape, where) for key, shape in SHAPES.items() if getattr(self, key)}
-        if self.vector_potential is not None:
-            truth = np.array(difference_jacobian(self._plain("vector_potential"), step)(*where))
-            slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * np.abs(found["vector_potential"]).max() / self.length
-            _compare("jacobian", found.get("jacobian"), truth, slack, "the derivatives of vector_potential")
-            expected = np.array([truth[2, 1] - truth[1, 2], truth[0, 2] - truth[2, 0], truth[1, 0] - truth[0, 1]])
-            _compare("magnetic", found.get("magnetic"), expected, slack, "the curl of vector_potential")
-        if self.potential is not None and not self.varies:
-            truth = np.array(difference_force(self._plain("potential"), step)(*where))
-            slack = AGREEMENT * np.abs(truth).max() + ROUND_OFF * abs(found["potential"]) / self.length
-            _compare("electric", found.get("electric"), truth, slack, "minus the gradient of potential")
-
-    def _value(self, key: str, shape: tuple[int, ...], where: tuple[float, ...]) -> np.ndarray:
-        value = np.asarray(self._plain(key)(*where))
-        if value.shape != shape or value.dtype.kind not in "fiu" or not np.isfinite(value).all():
-            raise ValueError(
-                f"ParticleField: {key} returned {value!r} at {np.array(where[1:])}; expected "
-                f"{'a finite number' if shape == () else f'finite numbers of shape {shape}'}."
-            )
-        return value
+        where = (t, *position)
+        # As partial functions, which are not compiled: that takes longer than a few calls.
+        plain = {key: self._of_time(partial(fun)) for key in SHAPES if (fun := getattr(self, key))}
+        found = {key: _value(key, fun, where) for key, fun in plain.items()}
+        for key, (source, derived, what) in CLAIMS.items():
+            if not {key, source} <= found.keys() or (self.varies and key == "electric"):
+                continue
+            rows = self._derivatives(_as_vector(plain[source]) if source == "potential" else plain[source])
+            slack = AGREEMENT * np.abs(rows(*where)).max() + ROUND_OFF * np.abs(found[source]).max() / self.length
+            expected = np.array(derived(rows)(*where))
+            if np.abs(found[key] - expected).max() > slack:
+                raise ValueError(
+                    f"ParticleField: {key} returned {found[key].tolist()}, but {what} there is {expected.tolist()}; "
+                    "correct one of them (or `length`, if the field changes over shorter distances)."
+                )
 
     def along(self, key: str, position: Any, t: Any = 0.0) -> np.ndarray:
         """Return "A", "E", "B" (3, m) or "phi" (m,) at points (3, m), and times (m,) for a field that varies."""
-        fun, points = getattr(self.functions, key), np.ascontiguousarray(np.transpose(position), dtype=float)
-        size = 1 if key == "phi" else 3
-        out = np.empty((len(points), size))
-        for row, time, point in zip(out, np.broadcast_to(t, len(points)), points, strict=True):
-            row[:] = fun(time, *point)
-        return out[:, 0] if size == 1 else out.T
+        fun, points = getattr(self.functions, key), np.transpose(position)
+        times = np.broadcast_to(t, len(points))
+        return np.array([fun(time, *point) for time, point in zip(times, points, strict=True)]).T
 
 
-SHAPES = {"vector_potential": (3,), "jacobian": (3, 3), "potential": (), "electric": (3,), "magnetic": (3,)}
-
-
-def _compare(key: str, given: np.ndarray | None, expected: np.ndarray, slack: float, what: str) -> None:
-    if given is not None and np.abs(given - expected).max() > slack:
+def _value(key: str, fun: Function, where: tuple[float, ...]) -> np.ndarray:
+    value, shape = np.asarray(fun(*where)), SHAPES[key]
+    if value.shape != shape or value.dtype.kind not in "fiu" or not np.isfinite(value).all():
         raise ValueError(
-            f"ParticleField: {key} returned {given.tolist()}, but {what} there is {expected.tolist()}; correct one of "
-            "them (or `length`, if the field changes over shorter distances)."
+            f"ParticleField: {key} returned {value!r} at {np.array(where[1:])}; expected "
+            f"{'a finite number' if shape == () else f'finite numbers of shape {shape}'}."
         )
+    return value
+
+
+# Functions of a field that follow from the rows dA_i/dx_j; a potential counts as the vector (phi, 0, 0).
+
+
+def _as_vector(phi: Function) -> Function:
+    return compiled_like(lambda t, x, y, z: (phi(t, x, y, z), 0.0, 0.0), phi)
+
+
+def _curl(rows: Function) -> Function:
+    def magnetic(t, x, y, z):
+        d = rows(t, x, y, z)
+        return d[2][1] - d[1][2], d[0][2] - d[2][0], d[1][0] - d[0][1]
+
+    return compiled_like(magnetic, rows)
+
+
+def _force(rows: Function) -> Function:
+    def electric(t, x, y, z):
+        slope = rows(t, x, y, z)[0]
+        return -slope[0], -slope[1], -slope[2]
+
+    return compiled_like(electric, rows)
+
+
+CLAIMS: dict[str, tuple[str, Callable[[Function], Function], str]] = {
+    "jacobian": ("vector_potential", lambda rows: rows, "the derivatives of vector_potential"),
+    "magnetic": ("vector_potential", _curl, "the curl of vector_potential"),
+    "electric": ("potential", _force, "minus the gradient of potential"),
+}
 
 
 # Uniform B = e_z with the potential 1e-2 / R.
@@ -206,11 +226,6 @@ def _uniform_electric(x, y, z):
     r2 = x * x + y * y
     w = POTENTIAL / (r2 * sqrt(r2))
     return w * x, w * y, 0.0
-
-
-@compilable
-def _uniform_magnetic(x, y, z):
-    return 0.0, 0.0, 1.0
 
 
 # Tokamak: A = (a x - b y, a y + b x, -log(R) / 2) with a = z / (2 R^2), b = ((1 - R)^2 + z^2) / (4 R^2).
@@ -248,30 +263,10 @@ def _tokamak_jacobian(x, y, z):
     )
 
 
-@compilable
-def _tokamak_magnetic(x, y, z):
-    r2 = x * x + y * y
-    c = 0.5 / r2
-    r = sqrt(r2)
-    return -c * (2.0 * y + x * z), c * (2.0 * x - y * z), c * (r2 - r)
-
-
 UNIFORM = ParticleField(
-    vector_potential=_uniform_vector_potential,
-    jacobian=_uniform_jacobian,
-    potential=_uniform_potential,
-    electric=_uniform_electric,
-    magnetic=_uniform_magnetic,
-    axisymmetric=True,
-    name="uniform",
+    _uniform_vector_potential, _uniform_jacobian, _uniform_potential, _uniform_electric, axisymmetric=True
 )
 """Uniform magnetic field e_z and potential 1e-2 / R (Cai, Gong & Wang, section 3.3); axisymmetric about z."""
 
-TOKAMAK = ParticleField(
-    vector_potential=_tokamak_vector_potential,
-    jacobian=_tokamak_jacobian,
-    magnetic=_tokamak_magnetic,
-    axisymmetric=True,
-    name="tokamak",
-)
+TOKAMAK = ParticleField(_tokamak_vector_potential, _tokamak_jacobian, axisymmetric=True)
 """Axisymmetric tokamak of major radius 1 without inductive electric field (Cai, Gong & Wang, section 3.3)."""
