@@ -61,7 +61,7 @@ STAYS = [
     "return np.array([{}, {}, {}])",
     "out = np.empty(4, np.complex128)\nout[:] = {} + {} * {} - {}\nreturn out",
     "if {} > {}:\n    return y\nreturn np.array([{}, {}, 1.0, 2.0])",
-    "for k in range(3):\n    out = np.empty(4)\n    out[:] = {}\n    if k > 1:\n        return out\nreturn y * ({} + {})",
+    "for k in range(3):\n    out = np.empty(4)\n    out[:] = {}\n    if k > 1:\n        return out\nreturn y * {}",
     "keep = np.array([{}, {}, {}, {}])\nother = keep\nkeep = np.zeros(4)\nreturn other if t < 0 else keep",
 ]
 TERMS = [
