@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,7 @@ from .particles import LinearInvariants, particle_invariants
 if TYPE_CHECKING:
     from .runs import Run
 
-__all__ = ["NEAR_DISTANCE", "NOTHING", "Conserved", "confirmed", "conserved", "reduced_rows"]
+__all__ = ["NEAR_DISTANCE", "NOTHING", "Conserved", "confirmed", "conserved", "reduced_rows", "states_near"]
 
 # Largest state whose linear invariants are searched for: the time grows with the cube of the number of components.
 MOST_COMPONENTS = 300
@@ -184,10 +184,7 @@ class _Samples:
     def points(self) -> tuple[Array, Array]:
         """Return states (m, n) and derivatives, which are NaN where the function fails."""
         near, far = (max(self.y.size, NEAR), FAR) if self.is_wide else (NEAR, 0)
-        ways = _directions(near, far, self.y.size)
-        if not self.y.all():  # a component that is 0 at the start may have to stay nonnegative, as a concentration
-            ways = np.where(self.y == 0, np.abs(ways), ways)
-        y = self.y + ways * self.sizes
+        y = states_near(self.y, self.sizes, near * [NEAR_DISTANCE] + far * [FAR_DISTANCE])
         f = np.full_like(y, np.nan)
         t0, t_bound = self.run.invariants.t_span
         span = t_bound - t0 if np.isfinite(t_bound) else 0.0
@@ -214,11 +211,18 @@ class _Samples:
         yield from zip(*self.points, self.gradients, strict=False)
 
 
+def states_near(y: Array, sizes: Array, distances: Sequence[float]) -> Array:
+    """Return states (m, n) at these distances from y, in units of the sizes of its components: the same in each run.
+
+    Components that are 0 at y may have to stay nonnegative, as concentrations, and do so.
+    """
+    ways = _ways(len(distances), y.size) * np.array(distances)[:, None]
+    return np.asarray(y + np.where(y == 0, np.abs(ways), ways) * sizes)
+
+
 @lru_cache(maxsize=8)
-def _directions(near: int, far: int, n: int) -> Array:
-    """Return random directions (near + far, n), the same in each run, of lengths that suit the distances."""
-    ways = np.tanh(np.random.default_rng(20220).standard_normal((near + far, n)))
-    return ways * np.repeat([NEAR_DISTANCE, FAR_DISTANCE], [near, far])[:, None]
+def _ways(count: int, n: int) -> Array:
+    return np.tanh(np.random.default_rng(20220).standard_normal((count, n)))
 
 
 def found_invariants(y: Array, f: Array) -> LinearInvariants:

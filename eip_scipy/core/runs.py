@@ -15,7 +15,7 @@ from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonF
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
 from .callers import users_level
-from .conserved import Conserved, confirmed, conserved
+from .conserved import Conserved, confirmed, conserved, states_near
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .failures import projection_failure
 from .invariant_checks import Finding, listed, reported
@@ -214,7 +214,7 @@ class Run:
         held = are_combinations(linear, G.view(float))
         if not np.count_nonzero(held):
             return self.options.scales
-        away = y0 + COMBINATION_DISTANCE * (np.abs(y0) + tau * np.abs(f0)) * np.cos(np.arange(y0.size))
+        (away,) = states_near(y0, np.abs(y0) + tau * np.abs(f0), [COMBINATION_DISTANCE])
         held &= are_combinations(linear, invariants.gradients(t0, away, f0).view(float))
         return np.where(held, invariants.sizes_of_terms(y0, G, self.work.values) / EPS, self.options.scales)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checkpoint import require_place
-from ..core.conserved import NEAR_DISTANCE, confirmed
+from ..core.conserved import NEAR_DISTANCE, confirmed, states_near
 from ..core.derivatives import unless_error
 from ..core.events import Events
 from ..core.functions import PointerFunction, extra_arguments, floats, is_compiled, parameter_values
@@ -423,7 +423,7 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
     holds = len(C) > 0 and (len(first) == 1 or ready.problem.variations is None)
     if holds and len(first) > 1:
-        y = everyone.y0s[first] * (1 + NEAR_DISTANCE * np.cos(np.arange(plan.size)))
+        y = np.array([states_near(start, np.abs(start), [NEAR_DISTANCE])[0] for start in everyone.y0s[first]])
         f, own = np.full(y.shape, np.nan), parameters.copy()
         for k, member in enumerate(first):
             parameters[:] = everyone.params[member]
