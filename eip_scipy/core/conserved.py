@@ -138,7 +138,8 @@ def _masses_from_f(samples: _Samples, rows: Array) -> Array | None:
     masses = np.full((G.shape[1], v.shape[1]), np.nan)
     for k in rows:
         by_q, by_v = np.split(G[:, k], 2, axis=1)
-        M = _rounded((by_v * v - by_q * a).sum(axis=0) / (v * v + a * a).sum(axis=0))
+        moving = (v * v + a * a).sum(axis=0)
+        M = _rounded((by_v * v - by_q * a).sum(axis=0) / np.where(moving == 0, 1.0, moving))
         errors, sizes = np.abs([by_q + M * a, by_v - M * v]), np.abs([by_q, by_v])
         if (errors <= HOLDS * sizes.max(axis=2, keepdims=True)).all():  # also False if one is not finite
             masses[k] = M

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.integrate
 from scipy.integrate import DenseOutput, OdeSolver
 
-from ..engine.data import FOUND, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, bare_schedule
+from ..engine.data import FOUND, FROM_F, NEXT_LENGTH, NFEV, NJEV, NLU, OK, PENDING, WAITED, bare_schedule
 from ..engine.trust import ProjectionWarning
 from ..methods.base import Method
 from ..methods.gauss_jackson import GaussJackson
@@ -325,6 +325,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         """Continue from `here`, the last time and state, with other tolerances, or another interval or function."""
         run, work = self._run, self._run.work
         run.examine(here.y, here.f, is_known=not new_function)
+        work.counters[FROM_F] &= not new_function
         run.invariants.t_span = (run.invariants.t_span[0], float(self.t_bound))
         fresh = run.projection.validate(run.method, run.stepping, run.y0, run.start.f, run.invariants)[0]
         run.options = run.options._replace(rtol=fresh.rtol, atol=fresh.atol, block_atol=fresh.block_atol)

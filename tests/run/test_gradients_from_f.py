@@ -367,3 +367,26 @@ def test_dense_output_and_evaluations():
     np.testing.assert_allclose([energy(0, y) for y in result.y.T], energy(0, start()), rtol=1e-12)
     given = Invariant(energy, lambda t, y: np.concatenate([-fun(t, y)[N:], y[N:]]))
     assert result.nfev == solve_ivp(fun, (0.0, 3.0), start(), invariants=[given], **options).nfev
+
+
+def test_a_function_that_is_set_between_two_steps():
+    """Nothing is known of its components."""
+    fun, energy = chain("FPUT", "wells")
+    solver = EIPRK4(fun, 0.0, start(), 3.0, h=0.05, invariants=Invariant(energy, name="H"))
+    solver.step()
+    assert FROM_F in str(solver.diagnostics)
+    solver.fun = chain("FPUT", "wells", turn=0.4)[0]
+    solver.step()
+    assert REFUTED in str(solver.diagnostics)
+    while solver.status == "running":
+        solver.step()
+    assert solver.diagnostics.trusted
+
+
+def test_massless_particles_and_components_at_rest():
+    def fun(t, y):  # q0 moves q1, which has no mass, and q2 rests
+        return np.array([y[3], y[4], 0.0, -(y[0] ** 3), y[0] - y[1], 0.0])
+
+    found = run(fun, lambda t, y: y[3] ** 2 / 2 + y[0] ** 4 / 4, [1.0, 0.5, 0.2, 0.0, 0.3, 0.0])
+    assert is_from_f(found)
+    assert found.trusted
