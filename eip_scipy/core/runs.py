@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from ..engine import data
-from ..engine.data import EPS, NOTHING, REASON, Schedule, Work
+from ..engine.data import EPS, NOTHING, OK, PENDING, REASON, Schedule, Work, bare_schedule
 from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["Run", "Start"]
 
 START_ITERATIONS = 50
+# Steps without projections that are made for comparison in a faulty run, and how much longer they are in one that ends.
+FREE_STEPS, SLOWED, LEAST_STEPS = 10, 5.0, 100
 COMBINATION_DISTANCE = 1e-4
 
 # Attributes that `restore` makes again, and those that a copy does not need.
@@ -331,6 +333,30 @@ class Run:
             self.examiner.examine(suspect, rhs)  # once more for the rates, which are used to judge corrections
         self.trust.doubts += [found] if found else []
         return found is not None or self._is_doubtful(ended)
+
+    def slowed(self, steps: int, t: float, y: Array) -> str:
+        """Return a sentence if the projections of a faulty run make its adaptive steps much shorter; else "".
+
+        After 100, 1000, ... steps, which led to (t, y), some are made from there without projections, for comparison.
+        """
+        faulty = self.options.adaptive and not self.method.in_python and self.trust.beyond_doubt and self.trust.doubts
+        if not faulty or steps < LEAST_STEPS or not is_check_due(steps):
+            return ""
+        problem, span = self.problem, self.stepping.span
+        count, stepping = problem.count, self.stepping._replace(span=span._replace(t0=t), first_step=None)
+        free = Run(problem, self.name, self.method, stepping, ProjectionOptions(check=False))
+        free.start_at(y, check=False, is_known=True)
+        free.work.K[0], free.schedule = free.start.f, bare_schedule(stepping.span, free.start.tau)
+        free.schedule.place[PENDING] = 1  # steps are made one by one
+        engine, here = free.engine(problem.in_python(free)), (OK, t, y, free.start.f)
+        for k in range(FREE_STEPS):
+            if here[0] == OK:
+                here = engine.step(k, *here[1:])
+        problem.count = count
+        longer = abs(here[1] - t) / FREE_STEPS / (abs(t - self.begin.t) / steps)
+        if here[0] != OK or not longer > SLOWED:
+            return ""
+        return f"its projections make the steps {longer:.3g} times shorter than the equations need, and it was ended"
 
     def _is_doubtful(self, ended: bool) -> bool:
         """Return True if corrections or errors show that the run is faulty, before its end without hope of recovery."""

@@ -442,6 +442,9 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
             self.h_abs = run.schedule.clock.item(NEXT_LENGTH)
         if found != self._noted or is_check_due(self._steps) or self.t == self.t_bound:
             self._watch()
+            if slowed := run.slowed(self._steps, t, y_new):
+                run.trust.failed = True
+                return False, slowed
         return True, None
 
     def _watch(self, *, ended: bool = False) -> None:

@@ -311,7 +311,9 @@ class BatchRunner:
                     found.append(examiner.finding(derivative, float(out["t"][k]), out["y"][k]))
                     at_ends = found[-1] is not None
                 trust.doubts += list(filter(None, found))[:1]
-            if not trust.trusted:
+            if run.options.adaptive and trust.beyond_doubt:
+                out["status"][k] = NOT_RUN  # alone it may end early
+            elif not trust.trusted:
                 out["trusted"][k] = False
                 out["message"][k] += f"; {trust.message}"
 

@@ -21,7 +21,7 @@ __all__ = ["continue_to", "continued"]
 # Options of `integrate` that may change where a run continues. Everything else has fixed a value of the first part,
 # such as the target of an invariant, or the start that derivatives refer to.
 CHANGING = (
-    *("method", "h", "rtol", "atol", "first_step", "max_step"),
+    *("method", "h", "rtol", "atol", "first_step", "max_step", "max_steps"),
     *("save_every", "t_eval", "events", "callback", "progress", "compiled", "max_bytes"),
     *("checkpoint", "checkpoint_every", "resume", "check", "project_initial"),
 )

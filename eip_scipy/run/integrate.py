@@ -23,6 +23,7 @@ from ..core.projection import ProjectionKeywords, ProjectionOptions, takes_proje
 from ..core.results import Diagnostics
 from ..core.runs import Run
 from ..core.solvers import EIPSolver
+from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
 from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, TIME
 from ..engine.trust import ProjectionWarning
@@ -75,6 +76,7 @@ def integrate(
     atol: Any = DEFAULT,
     first_step: float | None = None,
     max_step: float = np.inf,
+    max_steps: int | None = None,
     **projection: Unpack[ProjectionKeywords],
 ) -> IntegrationResult:
     """Integrate with fixed or adaptive steps, compiled if the functions are Numba functions.
@@ -173,6 +175,9 @@ def integrate(
         As for the solver classes, see `EIPSolver`. Functions of invariants are called as
         ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
         the run instead.
+    max_steps : int, optional
+        Largest number of steps; a run that needs more ends with status -1, and keeps what it has. A faulty run with
+        adaptive steps also ends early if its projections make the steps much shorter than the equations need.
     diagnostics, first_step, max_step, rtol, atol
         As for the solver classes; `rtol` and `atol` are 1e-3 and 1e-6 by default. If `h` is given, they only scale the
         error metric.
@@ -251,7 +256,8 @@ class Loop:
             own = identity(run, run.begin.y, problem.parameters)
             keeper.begin(self.driver, own, problem.derivative, self.events)
         self._chunk, self._seconds, self._begin = FIRST_CHUNK, 0.0, 0.0
-        self._doubtful = self._event_ended = False
+        self._doubtful = self._event_ended = self._ended_early = False
+        self._most_steps = UNBOUNDED if given.max_steps is None else given.max_steps
 
     def run(self) -> IntegrationResult:
         """Run to the end, and return the result; an exception gets it as its attribute `partial`."""
@@ -263,7 +269,7 @@ class Loop:
             if keeper is not None:
                 keeper.end(status, message)
             result = self._result(status, message)
-            if self._doubtful and status >= 0:
+            if self._doubtful and (status >= 0 or self._ended_early):
                 text = f"{driver.run.name}: {driver.run.trust.message}"
                 warnings.warn(text, ProjectionWarning, stacklevel=users_level())
         except BaseException as error:
@@ -316,6 +322,11 @@ class Loop:
                 return -1, failure(code, driver.run, schedule.clock)
             if is_check_due(driver.step) or driver.run.work.suspect[REASON] != NOTHING:
                 self._check()
+                if slowed := driver.run.slowed(driver.step, *driver.now):
+                    self._ended_early = True
+                    return -1, slowed
+            if driver.step >= self._most_steps and schedule.clock[TIME] != schedule.span.t_bound:
+                return -1, f"max_steps={self._most_steps} steps were made, up to t={driver.now[0]:.10g}"
             if code == FULL:
                 driver.grow()
             elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
@@ -335,7 +346,7 @@ class Loop:
         driver, schedule, span = self.driver, self.driver.schedule, self.driver.schedule.span
         history, left = driver.run.stepper.multistep, span.n_steps - driver.step
         chunk = left if history is not None and left - history.middle <= self._chunk else self._chunk
-        chunk = min(chunk, steps_to_check(driver.step))
+        chunk = max(1, min(chunk, steps_to_check(driver.step), self._most_steps - driver.step))
         if self.given.callback is None:
             return chunk
         if schedule.t_eval.size:

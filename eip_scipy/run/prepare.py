@@ -85,6 +85,7 @@ class RunArguments(NamedTuple):
     atol: Any = DEFAULT
     first_step: Any = None
     max_step: Any = np.inf
+    max_steps: int | None = None
     projection: Mapping[str, Any] = MappingProxyType({})
 
     @classmethod
@@ -308,6 +309,8 @@ def _check_choices(request: RunArguments) -> None:
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
         raise ValueError(f"compiled must be True, False or None (compile if possible), got {shown(compiled)}.")
     check_bytes(request.max_bytes)
+    if request.max_steps is not None:
+        count("max_steps", request.max_steps)
 
 
 def _schedule(span: Span, tau: float, request: RunArguments, events: Events) -> Schedule:

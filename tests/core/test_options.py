@@ -19,7 +19,7 @@ def test_keywords_for_type_checkers_are_the_options():
     assert sorted(ProjectionKeywords.__annotations__) == sorted(NAMES)
     given = set(inspect.signature(ensemble).parameters) | set(EnsembleKeywords.__annotations__)
     assert set(EnsembleKeywords.__annotations__) >= {*NAMES} - {"invariants"}
-    alone = {"y0", "diagnostics", "variations", "jvp", "symplectic", "dense_output"}
+    alone = {"y0", "diagnostics", "variations", "jvp", "symplectic", "dense_output", "max_steps"}
     assert given >= set(inspect.signature(integrate).parameters) - alone
 
 
