@@ -36,14 +36,11 @@ from ._rebound_exchange import exit_events, problem_from_simulation, read_archiv
 from ._rebound_exchange import state as _state
 
 __all__ = [
-    "INTEGRATORS", "ReboundRun", "ReboundSteps", "exit_events", "ias15_steps", "keep_ctrl_c", "megno",
+    "INTEGRATORS", "ReboundRun", "exit_events", "keep_ctrl_c", "megno",
     "problem_from_simulation", "read_archive", "run", "simulation", "to_archive", "to_simulation",
 ]  # fmt: skip
 
 INTEGRATORS = ("whfast", "whfast-c17", "ias15", "leapfrog", "saba(10,6,4)")
-
-# REBOUND's numbers of IAS15's step criteria.
-_CRITERIA = {"global": 1, "prs23": 2}
 
 # Steps between two checks for Ctrl-C, which Python handles only outside of REBOUND's loop. Version 4 counts in 32 bits.
 _CHUNK = 100_000
@@ -81,25 +78,6 @@ class ReboundRun:
     steps: int
     energy_error: np.ndarray
     angular_momentum_error: np.ndarray
-
-
-@dataclass(frozen=True)
-class ReboundSteps:
-    """Result of `ias15_steps`; m - 1 steps, N bodies, n = 6 N.
-
-    Attributes
-    ----------
-    t : ndarray, shape (m,)
-        Start, and the end of each step.
-    y : ndarray, shape (n, m)
-        States (q, v) at `t`.
-    nfev : int
-        Number of evaluations of all bodies' accelerations.
-    """
-
-    t: np.ndarray
-    y: np.ndarray
-    nfev: int
 
 
 @contextmanager
@@ -194,8 +172,6 @@ def run(
     n_steps: int | None = None,
     t_end: float | None = None,
     save_every: int | None = None,
-    epsilon: float | None = None,
-    criterion: str | None = None,
     prepare: Callable[[rebound.Simulation], Any] | None = None,
 ) -> ReboundRun:
     """Integrate N bodies forward from t = 0 with one of REBOUND's integrators.
@@ -221,14 +197,9 @@ def run(
         End, a whole number of steps from 0; the run then ends at round(t_end / h) h.
     save_every : int, optional
         Save every `save_every`-th state in addition to the first and the last; default: only these two.
-    epsilon : float, optional
-        Tolerance of "ias15"; default: REBOUND's own, 1e-9, which is tight: about machine precision.
-    criterion : {"prs23", "global"}, optional
-        How "ias15" finds its steps. "prs23": from each body's derivatives, which is REBOUND's default since version 4
-        and takes very small steps if an acceleration passes through zero. "global": from the largest derivatives over
-        all bodies, as in the paper of 2015. Default: REBOUND's own.
     prepare : callable, optional
-        ``prepare(simulation)`` before the run, for example to add forces by REBOUNDx; what it returns is kept alive.
+        ``prepare(simulation)`` before the run, for example to set IAS15's tolerance (in version 5
+        ``simulation.integrator.epsilon``) or to add forces by REBOUNDx; what it returns is kept alive.
         The errors of the invariants remain those of the Newtonian ones.
 
     Returns
@@ -265,7 +236,7 @@ def run(
     steps = _count_steps(h, n_steps, t_end)
     saved = np.append(np.arange(0, steps, steps if save_every is None else count("save_every", save_every)), steps)
     sim = simulation(gm, y0)
-    _set_integrator(sim, integrator, epsilon, criterion)
+    _set_integrator(sim, integrator)
     kept = None if prepare is None else prepare(sim)
     if integrator != "ias15":
         sim.dt = h
@@ -295,49 +266,6 @@ def run(
         energy_error=energy_error,
         angular_momentum_error=angular_momentum_error,
     )
-
-
-def ias15_steps(
-    gm: Any, y0: Any, t_end: float, *, epsilon: float | None = None, criterion: str | None = None
-) -> ReboundSteps:
-    """Integrate forward from t = 0 with IAS15, record each step and count each evaluation.
-
-    Parameters
-    ----------
-    gm, y0, epsilon, criterion
-        As for `run`.
-    t_end : float
-        End, which the last step meets exactly.
-
-    Returns
-    -------
-    ReboundSteps
-        The run takes the steps of ``run(gm, y0, "ias15", h=t_end, n_steps=1)``. Time that call instead: recording the
-        steps from Python takes many times longer.
-
-    Raises
-    ------
-    ValueError
-        If a value is wrong, as in `run`.
-    """
-    sim = simulation(gm, y0)
-    _count_steps(t_end, 1, None)
-    _set_integrator(sim, "ias15", epsilon, criterion)
-    times, states, evaluations = [0.0], [_state(sim)], 0
-
-    def note(_: Any) -> None:
-        nonlocal evaluations
-        evaluations += 1
-
-    def look(_: Any) -> None:
-        if sim.t != times[-1]:
-            times.append(sim.t)
-            states.append(_state(sim))
-
-    sim.additional_forces, sim.heartbeat = note, look
-    with keep_ctrl_c():
-        sim.integrate(t_end, exact_finish_time=1)
-    return ReboundSteps(np.array(times), np.array(states).T, evaluations)
 
 
 def _check_state(gm: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -372,9 +300,7 @@ def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
     return n_steps
 
 
-def _set_integrator(
-    sim: rebound.Simulation, name: str, epsilon: float | None = None, criterion: str | None = None
-) -> None:
+def _set_integrator(sim: rebound.Simulation, name: str) -> None:
     family = name.removesuffix("-c17").removesuffix("(10,6,4)")
     sim.integrator = family
     # Version 4 keeps an integrator's options in sim.ri_<family>, version 5 in sim.integrator.
@@ -388,17 +314,6 @@ def _set_integrator(
         options.type = "10,6,4" if version_4 else "10_6_4"
     if name == "whfast-c17":
         options.corrector = 17
-    given = [what for what, value in (("epsilon", epsilon), ("criterion", criterion)) if value is not None]
-    if given and name != "ias15":
-        raise ValueError(f"{' and '.join(given)} can be given only with integrator='ias15', got {name!r}")
-    if epsilon is not None:
-        if not (epsilon > 0 and math.isfinite(epsilon)):
-            raise ValueError(f"epsilon must be positive and finite, got {epsilon!r}")
-        options.epsilon = epsilon
-    if criterion is not None:
-        if criterion not in _CRITERIA:
-            raise ValueError(f"unknown criterion {criterion!r}: expected one of {', '.join(map(repr, _CRITERIA))}")
-        options.adaptive_mode = _CRITERIA[criterion]
 
 
 def _invariant_errors(gm: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
