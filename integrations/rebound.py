@@ -98,12 +98,8 @@ def problem_from_simulation(
     Raises
     ------
     TypeError, ValueError
-        If `sim` is not a simulation, or has features that the N-body problem lacks: the message says which.
-
-    Warns
-    -----
-    UserWarning
-        If the simulation has a heartbeat, which a problem cannot hold.
+        If `sim` is not a simulation, or has features that the N-body problem lacks: the message says which. A
+        UserWarning says that a problem cannot hold a heartbeat.
     """
     if not isinstance(sim, rebound.Simulation):
         advice = "read one from an archive by rebound.Simulation(path)"
@@ -111,9 +107,8 @@ def problem_from_simulation(
     for what in _unsupported(sim):
         raise ValueError(f"the simulation has a feature that an N-body problem of eip_scipy does not support: {what}")
     if sim._heartbeat:
-        advice = "If it ends the simulation or changes particles, give integrate events=... or callback=... instead."
-        text = f"problem_from_simulation: the simulation's heartbeat is not called by runs of the problem. {advice}"
-        warnings.warn(text, UserWarning, stacklevel=users_level())
+        text = "heartbeat is not called by runs of the problem; if they need it, give integrate events= or callback="
+        warnings.warn(f"problem_from_simulation: the simulation's {text}", UserWarning, stacklevel=users_level())
     if forces is None and constants is not None:
         raise ValueError("constants= needs forces=..., to which they belong; forces of REBOUNDx have their own.")
     t_span = (sim.t, sim.t + 1000 * sim.dt) if t_span is None else t_span
@@ -143,10 +138,10 @@ def exit_events(sim: rebound.Simulation) -> list[Any]:
     """Return terminal events for ``sim.exit_max_distance`` (from the origin) and ``sim.exit_min_distance`` (of bodies).
 
     REBOUND checks them after each step, while an event is located within it. If a distance is exceeded at the start,
-    the run ends there. Simulations with the same distance share the event.
+    the run ends there.
     """
     given = [(name, float(getattr(sim, name))) for name in ("exit_max_distance", "exit_min_distance")]
-    return [_exit_event(name, limit) for name, limit in given if limit > 0]
+    return [_ExitEvent(name, limit) for name, limit in given if limit > 0]
 
 
 def to_simulation(
@@ -178,11 +173,7 @@ def to_simulation(
     ------
     TypeError, ValueError
         If `run` is neither a problem of bodies nor a run of one, shapes or masses do not fit, or there is no such row.
-
-    Warns
-    -----
-    UserWarning
-        If the problem has forces other than Newton's, which a simulation gets from REBOUNDx only: attach them there.
+        A UserWarning says that forces other than Newton's are to be attached by REBOUNDx.
     """
     bodies = bodies_of(run)
     time, start = _chosen(run, bodies.problem, y, row, t)
@@ -371,10 +362,10 @@ def run(
     for key, value in options.items():
         setattr(own, key, value)
     saved = saved_steps(_count_steps(h, n_steps, t_end), 0 if save_every is None else count("save_every", save_every))
-    kept = None if prepare is None else prepare(sim)
+    _kept = None if prepare is None else prepare(sim)  # until the end of the run
     if integrator != "ias15":
         sim.dt = h
-    rows, wall_time = [_row(sim)], 0.0
+    rows, wall_time = [(_state(sim), [sim.energy()], sim.angular_momentum())], 0.0
     for first, last in pairwise(saved.tolist()):
         start = perf_counter()
         if integrator == "ias15":
@@ -385,8 +376,7 @@ def run(
                 sim.steps(min(_CHUNK, last - done))
         sim.synchronize()
         wall_time += perf_counter() - start
-        rows.append(_row(sim))
-    del kept
+        rows.append((_state(sim), [sim.energy()], sim.angular_momentum()))
     y, *conserved = map(np.array, zip(*rows, strict=True))
     errors = [np.linalg.norm(values - values[0], axis=1) / (np.linalg.norm(values[0]) or 1.0) for values in conserved]
     more = {"name": integrator, "version": rebound.__version__, "wall_time": wall_time, "steps": int(sim.steps_done)}
@@ -394,23 +384,14 @@ def run(
     return _result(saved * h, y, _masses(sim), f"{integrator} of REBOUND", **more)
 
 
-def _row(sim: rebound.Simulation) -> tuple[np.ndarray, list[float], list[float]]:
-    """Return the state, the Newtonian energy and the angular momentum."""
-    return _state(sim), [sim.energy()], list(sim.angular_momentum())
-
-
-def _positive(name: str, value: Any) -> None:
-    if not (is_number(value, name) and 0 < value < math.inf):
-        raise ValueError(f"{name} must be positive and finite, got {value!r}")
-
-
 def _count_steps(h: float, n_steps: int | None, t_end: float | None) -> int:
-    _positive("h", h)
+    for name, value in (("h", h), ("t_end", 1.0 if t_end is None else t_end)):
+        if not (is_number(value, name) and 0 < value < math.inf):
+            raise ValueError(f"{name} must be positive and finite, got {value!r}")
     if (n_steps is None) == (t_end is None):
         raise ValueError("give either n_steps or t_end, and not both")
     if t_end is None:
         return count("n_steps", n_steps)
-    _positive("t_end", t_end)
     n_steps = round(t_end / h)
     # The looser bound is for long runs, in which the rounding of h alone moves t_end / h away from an integer.
     if n_steps < 1 or abs(t_end / h - n_steps) > max(1e-9, 8 * np.finfo(float).eps * n_steps):
@@ -425,8 +406,28 @@ def _result(t: Any, y: Any, gm: Any, message: str, names: Any = None, units: str
     return OptimizeResult(t=np.array(t), y=np.array(y).T, success=True, status=0, **known, **own)
 
 
-@cache  # and thus compiled once
-def _exit_event(name: str, limit: float) -> Any:
+class _ExitEvent:
+    """Terminal event of a distance that ends a simulation; its value is negative beyond the limit.
+
+    Native runs call `jitted`. It is not the event itself, because Numba functions that are sent to other processes lose
+    their attributes.
+    """
+
+    terminal, direction = True, -math.inf  # a limit, which also counts at the start
+
+    def __init__(self, name: str, limit: float) -> None:
+        self.__name__, self._limit = name, limit
+
+    def __call__(self, t: float, y: np.ndarray, *_: Any) -> float:
+        return float(_exit_function(self.__name__, self._limit)(t, y))
+
+    @property
+    def jitted(self) -> Any:
+        return jitted(_exit_function(self.__name__, self._limit))
+
+
+@cache  # so that it is compiled once
+def _exit_function(name: str, limit: float) -> Any:
     # Loops, because Numba compiles reductions of arrays for seconds.
     def exit_max_distance(t: float, y: np.ndarray, *_: Any) -> float:
         largest = 0.0
@@ -441,9 +442,7 @@ def _exit_event(name: str, limit: float) -> Any:
                 least = min(least, (y[k] - y[j]) ** 2 + (y[k + 1] - y[j + 1]) ** 2 + (y[k + 2] - y[j + 2]) ** 2)
         return math.sqrt(least) - limit
 
-    event = jitted(compilable(exit_max_distance if name == "exit_max_distance" else exit_min_distance))
-    event.terminal, event.direction = True, -math.inf  # a limit, which also counts at the start
-    return event
+    return compilable(exit_max_distance if name == "exit_max_distance" else exit_min_distance)
 
 
 def _state(sim: rebound.Simulation) -> np.ndarray:
