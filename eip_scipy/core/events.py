@@ -14,7 +14,7 @@ from ..engine.native import Call, call
 from .functions import by_pointer, is_pointer, names
 from .inputs import is_number, reals, require_arguments, shown
 
-__all__ = ["ContinuedEvents", "Events", "Start", "as_events", "replaced"]
+__all__ = ["ContinuedEvents", "Events", "JittedEvent", "Start", "as_events", "replaced"]
 
 # A value at the start is zero if it is at most this number of roundings of its terms and of the time, or if its zero is
 # within this share of the first step: the time of an event is a zero of an interpolant, and not known any better.
@@ -43,6 +43,18 @@ class ContinuedEvents(tuple):
         found = super().__new__(cls, events)
         found.happened = tuple(happened)
         return found
+
+
+class JittedEvent:
+    """A jitted event with its attributes, which Numba functions lose where they are sent to another process."""
+
+    def __init__(self, jitted: Any) -> None:
+        self.jitted, self.__name__ = jitted, jitted.__name__
+        self.terminal, self.direction = getattr(jitted, "terminal", None), getattr(jitted, "direction", 0)
+
+    def __call__(self, *given: Any) -> Any:
+        """Return the value of the event."""
+        return self.jitted(*given)
 
 
 class Events:

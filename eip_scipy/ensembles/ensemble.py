@@ -197,7 +197,7 @@ def ensemble(
         fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], h=h,
         method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
         **options,
-    ).with_pointers()  # fmt: skip
+    ).sendable()  # fmt: skip
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
     plan = _first_that_starts(Task(request, members, reduce), everyone)

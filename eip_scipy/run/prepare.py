@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.bound_problem import FORMS, BoundProblem
 from ..core.derivatives import First
-from ..core.events import Events, as_events, replaced
+from ..core.events import Events, JittedEvent, as_events, replaced
 from ..core.functions import (
     GRADIENT,
     AccelerationField,
@@ -22,6 +22,7 @@ from ..core.functions import (
     extra_arguments,
     floats,
     is_compiled,
+    is_jitted,
 )
 from ..core.inputs import count, flag, initial_state, real_array, shown
 from ..core.invariants import as_invariants, with_args
@@ -94,11 +95,16 @@ class RunArguments(NamedTuple):
         projection, others = ProjectionOptions.split(keywords)
         return cls(projection=projection, **others)
 
-    def with_pointers(self) -> RunArguments:
-        """Return the arguments with C functions wrapped, so that an error says why they cannot be pickled."""
+    def sendable(self) -> RunArguments:
+        """Return the arguments in a form for other processes: jitted events keep their attributes.
+
+        C functions are wrapped, so that an error says why they cannot be pickled.
+        """
         fun, acceleration = by_pointer(self.fun, "fun"), by_pointer(self.acceleration, "acceleration")
         jacobian = by_pointer(self.jacobian, "jacobian", GRADIENT, takes_f=True)
-        events = None if self.events is None else as_events(self.events)
+        events = self.fun.events if self.events is None and isinstance(self.fun, Problem) else self.events
+        items = as_events(events)
+        events = replaced(items, [JittedEvent(item) if is_jitted(item) else item for item in items]) or events
         return self._replace(fun=fun, acceleration=acceleration, events=events, jacobian=jacobian)
 
     def steps(self, own: Problem | None, method: Method) -> dict[str, Any]:

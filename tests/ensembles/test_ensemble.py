@@ -278,15 +278,29 @@ def test_bad_input():
 # Executors of concurrent.futures.
 
 
+@njit
+def jit_leaves(t, y, params):
+    return y[0] + 0.5
+
+
+jit_leaves.terminal = True
+
+
 @pytest.mark.slow
 @needs_jit
 def test_processes():
     y0s = starts(40)
     y0s[3] = np.nan
     here = ensemble(kepler(), SPAN, y0s, save_every=50)
+    until = {"fun": replace(kepler(), events=[jit_leaves]), "t_span": SPAN, "y0s": y0s, "h": 0.05}
+    ended = ensemble(**until)
     with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as executor:
         there = ensemble(kepler(), SPAN, y0s, save_every=50, executor=executor)
+        ended_there = ensemble(**until, executor=executor)
     same_fields(here, there)
+    assert 1 in ended.status  # jitted events keep their attributes
+    np.testing.assert_array_equal(ended.status, ended_there.status)
+    np.testing.assert_array_equal(ended.y, ended_there.y)
 
 
 def ends_its_process(t, y):
