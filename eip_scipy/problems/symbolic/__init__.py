@@ -95,10 +95,21 @@ def hamiltonian(
     True
     """
     with _sympy("hamiltonian"):
-        from .system import Perturbed, hamiltonian_problem
+        from .system import hamiltonian_problem
 
-        perturbed = Perturbed(perturbation, dissipation, balances)
-        return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended, perturbed)
+        return hamiltonian_problem(
+            H,
+            q,
+            p,
+            params=params,
+            invariants=invariants,
+            name=name,
+            poisson=poisson,
+            extended=extended,
+            perturbation=perturbation,
+            dissipation=dissipation,
+            balances=balances,
+        )
 
 
 def equations(
@@ -158,7 +169,7 @@ def equations(
     with _sympy("equations"):
         from .system import equations_problem
 
-        return equations_problem(f, y, params, invariants, constraints, name)
+        return equations_problem(f, y, params=params, invariants=invariants, constraints=constraints, name=name)
 
 
 def mechanics(
