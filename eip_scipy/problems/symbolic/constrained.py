@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,12 +11,12 @@ import sympy
 from ...core.functions import compilable, compiled_like, is_jitted, jitted
 from ..multibody.motion import new_floats, new_like
 from ..multibody.parts import Energy, Outputs, Parts
-from .brackets import BRANCHES, derivative
+from .brackets import derivative
 from .parser import symbol
 from .program import Arguments, function
 from .system import value_and_gradient
 
-__all__ = ["Constrained", "acceleration", "cyclic", "parts_of"]
+__all__ = ["Constrained", "acceleration", "parts_of"]
 
 
 class Constrained(NamedTuple):
@@ -46,27 +46,6 @@ class Constrained(NamedTuple):
         """Return the derivative of an expression in time for u' = 0."""
         terms = [sympy.diff(expression, symbol(x)) * dx for x, dx in zip(self.coordinates, self.rates, strict=True)]
         return sympy.Add(sympy.diff(expression, symbol("t")), *terms)
-
-
-def cyclic(system: Constrained, partial_speeds: Callable[[int], Sequence[Any]]) -> list[int]:
-    """Return the indices of coordinates whose momenta may be constant, because masses and forces do not depend on them.
-
-    ``partial_speeds(k)`` returns the derivatives (n,) of the speeds with respect to the rate of coordinate k, or [] if
-    they are not known; the coordinate is then left out. A coordinate is also left out if exactly one speed depends on
-    its rate and a constraint contains this speed, or if the force along it has branches or comes from a function,
-    because such a force may be 0 only near the start.
-    """
-    known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
-    inputs = {symbol(name) for name, _ in system.inputs}
-    constrained = set().union(*(item.free_symbols for item in system.velocities))
-    found = []
-    for k, name in enumerate(system.coordinates):
-        column = [] if symbol(name) in known else partial_speeds(k)
-        along = [(u, F) for u, F, part in zip(system.speeds, system.forces, column, strict=False) if part != 0]
-        unsure = any(F.has(*BRANCHES, sympy.Piecewise) or F.free_symbols & inputs for _, F in along)
-        if along and not unsure and not (len(along) == 1 and symbol(along[0][0]) in constrained):
-            found.append(k)
-    return found
 
 
 def acceleration(speed: str) -> sympy.Symbol:

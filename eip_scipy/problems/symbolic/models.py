@@ -21,9 +21,9 @@ from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import MET, Names, by_name
-from .brackets import drop_impulses, sampled_states
-from .constrained import Constrained, acceleration, cyclic, parts_of
-from .parser import TIME, as_expression, symbol
+from .brackets import BRANCHES, drop_impulses, sampled_states
+from .constrained import Constrained, acceleration, parts_of
+from .parser import TIME, as_expression, as_mapping, symbol
 from .program import function
 from .system import parameter_values
 
@@ -65,51 +65,38 @@ class _Model(NamedTuple):
 
 
 def mechanics_of_model(
-    model: Any,
-    params: Any,
-    q0: Any,
-    u0: Any,
-    *,
-    t_span: tuple[float, float] | None,
-    inputs: Any,
-    energy: Any,
-    potential_energy: Any,
-    outputs: Any,
-    independent: Iterable[Any] | None,
-    rank_tolerance: float,
-    name: str,
-    others: Mapping[str, Any],
+    model: Any, params: Any, start: tuple[Any, Any], inputs: Any, energies: tuple[Any, Any], outputs: Any, **others: Any
 ) -> MechanicsProblem:
-    """Return the problem of a model; see `mechanics`."""
-    values, q0, u0, inputs = _with_defaults(model, params, q0, u0, inputs)
-    t = 0.0 if t_span is None else float(t_span[0])
+    """Return the problem of a model; see `mechanics`. `energies` are the total and the potential energy that are given.
+
+    `others` are arguments of `mechanics_problem`.
+    """
+    values, start, inputs = _with_defaults(model, params, start, inputs)
+    t = 0.0 if others["t_span"] is None else float(others["t_span"][0])
     outputs = required_outputs("mechanics", outputs, ())
     method = _method(model)
     found = _of_lagrange(method) if hasattr(method, "_L") else _of_kane(method)
-    converted = _Conversion(found, inputs, t, q0, u0)
+    converted = _Conversion(found, inputs, t, start)
     system = converted.system()
-    energies = tuple(converted.energies(energy, potential_energy))
-    momenta = tuple(_momenta(found, system, converted))
+    kept, momenta = tuple(converted.energies(*energies)), tuple(_momenta(found, system, converted))
     observed = tuple((label, converted.output(label, item, values)) for label, item in outputs.items())
-    system = _with_parameters(system, [item for _, item in (*energies, *momenta, *observed)], values)
-    own, added = [f"v{k + 1}" for k in range(len(system.velocities))], _missing_velocities(system, values)
-    system = system._replace(velocities=(*system.velocities, *(system.rate(system.positions[k]) for k in added)))
-    positions = tuple(f"g{k + 1}" for k in range(len(system.positions)))
-    lacking = ", ".join(positions[k] for k in added)
-    notes = (f"velocity constraints were added for {lacking}, which the model lacks",) if added else ()
-    held = found.independent if independent is None else independent
+    system = _with_parameters(system, [item for _, item in (*kept, *momenta, *observed)], values)
+    given, lacking = len(system.velocities), _missing_velocities(system, values)
+    system = system._replace(velocities=(*system.velocities, *(system.rate(system.positions[k]) for k in lacking)))
+    positions, added = tuple(f"g{k + 1}" for k in range(len(system.positions))), [f"g{k + 1}" for k in lacking]
+    velocities = (*(f"v{k + 1}" for k in range(given)), *(f"{item}'" for item in added))
+    if others["independent"] is None:
+        others["independent"] = found.independent
+    elif not isinstance(others["independent"], str):
+        others["independent"] = [name_of(item) for item in others["independent"]]
     try:
         problem = mechanics_problem(
-            name,
-            parts_of(system, energies, momenta, observed),
-            Names(system.coordinates, system.speeds, positions, (*own, *(f"{positions[k]}'" for k in added))),
-            t,
-            (_named("q0", q0, system.coordinates), _named("u0", u0, system.speeds)),
-            np.array([values[key] for key in system.parameters]) if system.parameters else None,
-            None if held is None else [name_of(item) for item in held],
-            rank_tolerance,
-            t_span=t_span,
-            notes=notes,
+            parts=parts_of(system, kept, momenta, observed),
+            names=Names(system.coordinates, system.speeds, positions, velocities),
+            t=t,
+            start=tuple(map(_by_component, ("q0", "u0"), start, (system.coordinates, system.speeds))),
+            params=np.array([values[key] for key in system.parameters]) if system.parameters else None,
+            notes=(f"velocity constraints were added for {', '.join(added)}, which the model lacks",) * bool(added),
             parameter_names=system.parameters,
             **others,
         )
@@ -122,22 +109,22 @@ def mechanics_of_model(
     return problem
 
 
-def _with_defaults(model: Any, params: Any, q0: Any, u0: Any, inputs: Any) -> tuple[dict[str, float], Any, Any, Any]:
+def _with_defaults(model: Any, params: Any, start: Any, inputs: Any) -> tuple[dict[str, float], Any, Any]:
     """Return the parameters by name, the start, and the inputs, by default those that a System of PyDy has."""
     # PyDy refuses constants that are in the constraints on positions alone: they are given here.
     constants = getattr(model, "constants", None) or {}
     values = {**by_name("constants", constants, name_of), **by_name("params", params or {}, name_of)}
-    if q0 is None and u0 is None:
-        q0 = u0 = getattr(model, "initial_conditions", None)
-    if q0 is None or u0 is None:
+    if start[0] is None and start[1] is None:
+        start = (getattr(model, "initial_conditions", None),) * 2
+    if start[0] is None or start[1] is None:
         raise TypeError("mechanics: q0 or u0 is missing; give the coordinates and speeds at the start.")
     if inputs is None:  # functions f(y, t) of PyDy
         given = getattr(model, "specifieds", None) or {}
-        inputs = {key: partial(_swapped, x) if _is_function(x) else x for key, x in given.items()}
-    return parameter_values(values), q0, u0, inputs
+        inputs = {key: partial(_swapped, item) if _is_called(item) else item for key, item in given.items()}
+    return parameter_values(values), start, inputs
 
 
-def _is_function(item: Any) -> bool:
+def _is_called(item: Any) -> bool:
     return callable(item) and not isinstance(item, sympy.Basic)
 
 
@@ -145,7 +132,7 @@ def _swapped(function: Any, t: float, y: np.ndarray) -> Any:
     return function(y, t)
 
 
-def _named(what: str, given: Any, names: tuple[str, ...]) -> Any:
+def _by_component(what: str, given: Any, names: tuple[str, ...]) -> Any:
     """Return a mapping with names as keys, those in `names` or, if there are none, all; return an array unchanged."""
     if not isinstance(given, Mapping):
         return given
@@ -172,62 +159,51 @@ class _Conversion:
     `inputs` are those of `mechanics`. Functions among them are called once, at the start.
     """
 
-    def __init__(self, found: _Model, inputs: Any, t: float, q0: Any, u0: Any) -> None:
+    def __init__(self, found: _Model, inputs: Any, t: float, start: tuple[Any, Any]) -> None:
         self._found, self.names = found, {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
-        states = tuple(self.names.values())
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
         self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
         parts = [*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates]
         functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
-        self._inputs: dict[Any, Any] = {}  # expressions by function of time
-        self.called: list[tuple[str, Callable[..., float]]] = []  # functions f(t, y) by name
-        count = len(found.coordinates)
-        start = np.array([*_numbers(q0, states[:count]), *_numbers(u0, states[count:])])
-        self._read(inputs, {name_of(item): item for item in functions}, t, start)
-        self._called = {name for name, _ in self.called}
-        if taken := self._called & {*states, "t"}:
-            raise ValueError(
-                f"inputs: {taken.pop()!r} is also the name of the time or of a component of the state; rename it."
+        self._known = {name_of(item): item for item in functions}
+        self._inputs: dict[Any, Any] = {}  # expressions
+        self._called: dict[Any, Callable[..., float]] = {}  # functions f(t, y)
+        y = np.array([*_numbers(start[0], found.coordinates), *_numbers(start[1], found.speeds)])
+        for key, value in as_mapping("inputs", inputs).items():
+            self._read_input(
+                [self._function(item) for item in (key if isinstance(key, tuple) else (key,))], value, t, y
             )
+        self._called_names = set(map(name_of, self._called))
         symbols = (sympy.sympify(item).free_symbols for item in (*parts, *(item for _, item in found.energies)))
-        called = {item for item in functions if name_of(item) in self._called}
-        _require_different((TIME, *self.names, *sorted(called.union(*symbols), key=sympy.srepr)))
+        _require_different((TIME, *self.names, *self._called, *sorted(set().union(*symbols), key=sympy.srepr)))
 
-    def _read(self, inputs: Any, known: Mapping[str, Any], t: float, y: np.ndarray) -> None:
-        """Read the inputs; `known` are the functions of time in the model by name."""
-        if not isinstance(inputs, Mapping):
-            raise TypeError(
-                f"inputs must be a mapping of functions of time to expressions or functions, got {shown(inputs)}."
-            )
-        for key, value in inputs.items():
-            keys = [self._function_of_time(item, known) for item in (key if isinstance(key, tuple) else (key,))]
-            if is_function := _is_function(value):
-                values = np.ravel(value(t, y.copy())).tolist()
-            else:
-                values = [value] if len(keys) == 1 and not isinstance(value, tuple | list | np.ndarray) else list(value)
-            if len(values) != len(keys):
-                of_keys = ("function of {} returns" if is_function else "value of {} has").format(
-                    ", ".join(map(str, keys))
-                )
-                raise ValueError(f"inputs: the {of_keys} {len(values)} numbers; expected {len(keys)}.")
-            if is_function:
-                places = [None] if len(keys) == 1 else range(len(keys))
-                self.called += [(name_of(item), _component(value, k)) for item, k in zip(keys, places, strict=True)]
-                continue
-            for item, given in zip(keys, values, strict=True):
-                if not (is_number(given) or isinstance(given, sympy.Expr)):
-                    raise TypeError(
-                        f"inputs: {item} is {shown(given)}; expected a number, an expression of t and the state, or a "
-                        "function f(t, y)."
-                    )
-                self._inputs[item] = sympy.sympify(given)
-
-    def _function_of_time(self, key: Any, known: Mapping[str, Any]) -> Any:
+    def _function(self, key: Any) -> Any:
+        """Return the function of time that is meant by the key of an input."""
         if key in self.names or key in self.names.values():
             raise ValueError(f"inputs: {key} is a component of the state; inputs are the other functions of time.")
-        if isinstance(key, str) and key not in known:
-            raise ValueError(f"inputs: the model has no function {key!r}{nearest(key, known)}.")
-        return known[key] if isinstance(key, str) else key
+        if isinstance(key, str) and key not in self._known:
+            raise ValueError(f"inputs: the model has no function {key!r}{nearest(key, self._known)}.")
+        return self._known[key] if isinstance(key, str) else key
+
+    def _read_input(self, keys: list[Any], value: Any, t: float, y: np.ndarray) -> None:
+        """Read the value of an input, of which a function is called at (t, y)."""
+        if is_called := _is_called(value):
+            values = np.ravel(value(t, y.copy())).tolist()
+        else:
+            values = list(value) if len(keys) > 1 or isinstance(value, tuple | list | np.ndarray) else [value]
+        if len(values) != len(keys):
+            what = ("function of {} returns" if is_called else "value of {} has").format(", ".join(map(str, keys)))
+            raise ValueError(f"inputs: the {what} {len(values)} numbers; expected {len(keys)}.")
+        for k, (key, item) in enumerate(zip(keys, values, strict=True)):
+            if is_called:
+                self._called[key] = _component(value, k if len(keys) > 1 else None)
+            elif is_number(item) or isinstance(item, sympy.Expr):
+                self._inputs[key] = sympy.sympify(item)
+            else:
+                raise TypeError(
+                    f"inputs: {key} is {shown(item)}; expected a number, an expression of t and the state, or a "
+                    "function f(t, y)."
+                )
 
     def __call__(self, expression: Any) -> Any:
         """Return the converted expression."""
@@ -242,7 +218,7 @@ class _Conversion:
         expression = expression.xreplace({item: item.doit() for item in expression.atoms(sympy.Derivative)})
         left = sorted(expression.atoms(AppliedUndef, sympy.Derivative), key=lambda x: (x.args != (TIME,), str(x)))
         for item in reversed(left):
-            if isinstance(item, sympy.Derivative) or name_of(item) not in self._called:
+            if isinstance(item, sympy.Derivative) or name_of(item) not in self._called_names:
                 raise self._unknown(item)
         own = {*self._symbols.values(), *self._accelerations.values()}
         expression = expression.xreplace({item: symbol(name_of(item)) for item in left})
@@ -250,20 +226,20 @@ class _Conversion:
         return drop_impulses(expression)
 
     def _unknown(self, item: Any) -> ValueError:
-        inner = name_of(item.expr if isinstance(item, sympy.Derivative) else item)
-        if inner in self._called:
+        inner = item.expr if isinstance(item, sympy.Derivative) else item
+        if name_of(inner) in self._called_names:
             return ValueError(
                 f"mechanics: the equations contain the derivative {item} of an input that is a function without an "
-                f"expression; give it as an expression of t: inputs={{{inner!r}: ...}}."
+                f"expression; give it as an expression of t: inputs={{{name_of(inner)!r}: ...}}."
             )
         return ValueError(
             f"mechanics: {item} is neither a coordinate nor a speed; give it as an expression of t and the state, or a "
-            f"function f(t, y): inputs={{{inner!r}: ...}}."
+            f"function f(t, y): inputs={{{name_of(inner)!r}: ...}}."
         )
 
-    def _require_smooth(self, what: str, expression: Any) -> None:
+    def _require_smooth(self, what: str, expressions: Iterable[Any]) -> None:
         """Raise ValueError if a converted expression contains an input that is a function."""
-        if {item.name for item in expression.free_symbols} & self._called:
+        if {item.name for x in expressions for item in x.free_symbols} & self._called_names:
             raise ValueError(
                 f"mechanics: {what} depends on an input that is a function without an expression, and its derivatives "
                 "are needed. Give the input as an expression of t and the state."
@@ -274,11 +250,10 @@ class _Conversion:
         found, names = self._found, self.names
         parts = (found.rates, found.mass, found.forces, found.positions, found.velocities)
         rates, mass, forces, positions, velocities = (tuple(map(self, items)) for items in parts)
-        for what, items in (("a kinematic equation", rates), ("a constraint", (*positions, *velocities))):
-            for item in items:
-                self._require_smooth(what, item)
+        self._require_smooth("a kinematic equation", rates)
+        self._require_smooth("a constraint", (*positions, *velocities))
         coordinates, speeds = (tuple(names[item] for item in items) for items in (found.coordinates, found.speeds))
-        called = tuple(self.called)
+        called = tuple((name_of(key), function) for key, function in self._called.items())
         return Constrained(coordinates, speeds, (), rates, mass, forces, positions, velocities, called)
 
     def energies(self, energy: Any, potential_energy: Any) -> Iterator[tuple[str, Any]]:
@@ -290,8 +265,7 @@ class _Conversion:
         if potential_energy is not None:
             given += [(f"{label} and potential_energy=", item + potential_energy) for label, item in known]
         for label, item in given or ([] if self._called else known):
-            expression = self(item)
-            self._require_smooth("the energy", expression)
+            self._require_smooth("the energy", [expression := self(item)])
             yield label, expression
 
     def output(self, name: str, given: Any, parameters: Mapping[str, float]) -> Any:
@@ -313,12 +287,13 @@ def _called_in_python(fun: Callable[..., Any], k: int | None, t: float, y: np.nd
     return float(fun(t, y) if k is None else fun(t, y)[k])
 
 
-def _numbers(given: Any, names: Sequence[str]) -> list[float]:
+def _numbers(given: Any, components: Sequence[Any]) -> list[float]:
     """Return values with which functions can be called; components that were not given are 0."""
     if isinstance(given, Mapping):
         found = {name_of(key): value for key, value in given.items()}
-        return [float(found.get(name, 0.0)) for name in names]
-    return [float(value) for value in given] if np.shape(given) == (len(names),) else [0.0] * len(names)
+        return [float(found.get(name_of(item), 0.0)) for item in components]
+    known = np.shape(given) == (len(components),)
+    return [float(value) for value in given] if known else [0.0] * len(components)
 
 
 def _require_different(items: Iterable[Any]) -> None:
@@ -330,28 +305,35 @@ def _require_different(items: Iterable[Any]) -> None:
     for item in items:
         first = known.setdefault(name := name_of(item), item)
         if first != item:
-            # The representation of a symbol contains its assumptions, which make symbols different.
-            one, other = (
-                "the time, dynamicsymbols._t" if x == TIME else sympy.srepr(x) if x.is_Symbol else str(x)
-                for x in (first, item)
-            )
             raise ValueError(
-                f"mechanics: two different quantities are called {name!r}: {one} and {other}. Rename one or, if they "
-                "are meant to be the same, use one of them everywhere."
+                f"mechanics: two different quantities are called {name!r}: {_described(first)} and {_described(item)}. "
+                "Rename one or, if they are meant to be the same, use one of them everywhere."
             )
+
+
+def _described(item: Any) -> str:
+    """Return an item as text; that of a symbol contains its assumptions, which make symbols different."""
+    if item == TIME:
+        return "the time, dynamicsymbols._t"
+    return sympy.srepr(item) if isinstance(item, sympy.Symbol) else str(item)
 
 
 def _momenta(found: _Model, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
-    """Yield the names and expressions of momenta that may be constant."""
-    columns = {}
+    """Yield the names and expressions of momenta that may be constant: masses and forces lack their coordinates.
 
-    def partial_speeds(k: int) -> list[Any]:
-        columns[k] = [converted(item) for item in found.partial_speeds(k)]
-        return columns[k]
-
-    for k in cyclic(system, partial_speeds):
-        slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.speeds]
-        yield f"p_{system.coordinates[k]}", sympy.Add(*(a * b for a, b in zip(columns[k], slopes, strict=True)))
+    A coordinate is left out if exactly one speed depends on its rate and a constraint contains this speed, or if the
+    force along it has branches or comes from a function, because such a force may be 0 only near the start.
+    """
+    known = set().union(*(item.free_symbols for item in (*system.mass, *system.forces)))
+    inputs = {symbol(name) for name, _ in system.inputs}
+    constrained = {item.name for velocity in system.velocities for item in velocity.free_symbols}
+    for k, name in enumerate(system.coordinates):
+        column = [] if symbol(name) in known else [converted(item) for item in found.partial_speeds(k)]
+        along = [(u, F) for u, F, part in zip(system.speeds, system.forces, column, strict=False) if part != 0]
+        unsure = any(F.has(*BRANCHES, sympy.Piecewise) or F.free_symbols & inputs for _, F in along)
+        if along and not unsure and not (len(along) == 1 and along[0][0] in constrained):
+            slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.speeds]
+            yield f"p_{name}", sympy.Add(*(a * b for a, b in zip(column, slopes, strict=True)))
 
 
 def _kane_partial_speeds(method: Any, k: int) -> list[Any]:

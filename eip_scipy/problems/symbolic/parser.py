@@ -11,7 +11,7 @@ import keyword
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import sympy
@@ -19,7 +19,7 @@ from sympy.core.function import AppliedUndef
 
 from ...core.inputs import shown
 
-__all__ = ["LARGEST", "TIME", "as_expression", "as_names", "cbrt", "symbol", "with_powers_of_roots"]
+__all__ = ["LARGEST", "TIME", "as_expression", "as_mapping", "as_names", "cbrt", "symbol", "with_powers_of_roots"]
 
 
 class cbrt(sympy.Function):  # noqa: N801  # expressions show this name
@@ -85,6 +85,13 @@ LARGEST_EXPONENT, LARGEST = 1000, 10**300
 def symbol(name: str) -> sympy.Symbol:
     """Return the symbol of a name. It is real, so that sqrt(x**2) is abs(x)."""
     return sympy.Symbol(name, real=True)
+
+
+def as_mapping(what: str, given: Any) -> dict[Any, Any]:
+    """Return a mapping as a dictionary, {} for None; raise TypeError for other objects."""
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(f"{what} must be a mapping of names to values or expressions, got {shown(given)}.")
+    return dict(given or {})
 
 
 def as_names(what: str, names: Any) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from ...core.problem import Deferred, Problem, bind
 from ..multibody.motion import vector
 from .brackets import Equations, NotConservedError, derivative, shortened, vanishes
 from .pairs import paired, without_derivatives
-from .parser import as_expression, as_names, symbol
+from .parser import as_expression, as_mapping, as_names, symbol
 from .program import Arguments, function, variational
 
 __all__ = ["SymbolicProblem", "equations_problem", "hamiltonian_problem", "parameter_values", "value_and_gradient"]
@@ -169,43 +169,34 @@ def _again(kept: Sequence[Any], others: dict[str, Any]) -> SymbolicProblem:
 
 
 def hamiltonian_problem(
-    H: Any,
-    q: Any,
-    p: Any,
-    *,
-    params: Any,
-    invariants: Any,
-    name: str | None,
-    poisson: Any,
-    extended: bool,
-    perturbation: Any,
-    dissipation: Any,
-    balances: Any,
+    H: Any, q: Any, p: Any, *, poisson: Any, extended: bool, added: Any, params: Any, invariants: Any, name: str | None
 ) -> SymbolicProblem:
-    """Return the problem of a Hamiltonian; see `hamiltonian`."""
+    """Return the problem of a Hamiltonian; see `hamiltonian`. `added`: a perturbation, dissipation and balances."""
     values = parameter_values(params)
     declared = {*values, *(item for given in (q, p) if given is not None for item in as_names("q and p", given))}
     energy, time = as_expression("H", H, declared), symbol("t")
     names, pairs, B = _canonical(energy, q, p, values) if poisson is None else _lie_poisson(q, p, poisson, declared)
     scope = _Scope(names, values)
-    if not scope.known("H", energy).has(*map(symbol, names)):
-        raise ValueError(f"hamiltonian: H = {shortened(energy)} does not depend on {', '.join(names)}.")
+    scope.read_quantity("H", energy)
 
     def vector_field(F: Any) -> tuple[Any, ...]:
         return tuple(B * sympy.Matrix([derivative(F, symbol(item)) for item in names]))
 
     rates, kept, slow = vector_field(energy), {"H": energy}, tuple[Any, ...]()
+    perturbation, dissipation, balances = added
     if perturbation is not None or dissipation is not None:
-        if extended or energy.has(time):
+        if extended:
             raise ValueError(
                 "hamiltonian: extended=True keeps H + p_t, which a perturbation or dissipation changes; omit "
                 "extended=True, or perturbation= and dissipation=."
-                if extended
-                else "hamiltonian: H depends on t, so that it is not an integral; move such terms to perturbation=."
             )
-        added = scope.added_rates(vector_field, perturbation, dissipation)
-        slow = tuple(scope.balances(kept if balances is None else balances, rates, added))
-        rates, kept = tuple(a + b for a, b in zip(rates, added, strict=True)), {}
+        if energy.has(time):
+            raise ValueError(
+                "hamiltonian: H depends on t, so that it is not an integral; move such terms to perturbation=."
+            )
+        change = scope.added_rates(vector_field, perturbation, dissipation)
+        slow = tuple(scope.balances(kept if balances is None else as_mapping("balances", balances), rates, change))
+        rates, kept = tuple(a + b for a, b in zip(rates, change, strict=True)), {}
     elif balances is not None:
         raise TypeError(
             "hamiltonian: balances are given without a perturbation or dissipation. Integrals of H alone are "
@@ -219,21 +210,23 @@ def hamiltonian_problem(
         warnings.warn(
             "H depends on t, so that it is not an invariant, and the problem does not keep it. "
             "hamiltonian(..., extended=True) adds p_t with p_t' = -dH/dt to the state and keeps H + p_t.",
-            UserWarning,
             stacklevel=3,
         )
-    return _checked(name or "hamiltonian", scope, rates, kept, invariants, balances=slow, pairs=pairs)
+    return scope.problem(name or "hamiltonian", rates, kept, invariants, None, slow, pairs)
 
 
 def equations_problem(
-    f: Any, y: Any, *, params: Any, invariants: Any, constraints: Any, name: str | None
+    f: Any, y: Any, params: Any, invariants: Any, constraints: Any, name: str | None
 ) -> SymbolicProblem:
     """Return the problem y' = f(t, y); see `equations`."""
     names, rates, (invariants, constraints) = without_derivatives(f, y, invariants, constraints)
     scope = _Scope(names, parameter_values(params))
     rates = [scope.read(f"the derivative of {k}", item) for k, item in zip(names, rates, strict=True)]
-    hint = " If it is conserved only if constraints hold, pass them as constraints=."
-    return _checked(name or "equations", scope, rates, {}, invariants, constraints, hint=hint)
+    try:
+        return scope.problem(name or "equations", rates, {}, invariants, constraints)
+    except NotConservedError as error:
+        hint = "" if constraints else " If it is conserved only if constraints hold, pass them as constraints=."
+        raise NotConservedError(f"{error}{hint}") from None
 
 
 def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
@@ -281,11 +274,8 @@ class _Scope:
                 raise ValueError(f"{item} is the name of a component of the state and of a parameter; rename one.")
 
     def read(self, what: str, given: Any) -> Any:
-        """Return text or an expression as an expression whose names are known."""
-        return self.known(what, as_expression(what, given, {*self.components, *self.values}))
-
-    def known(self, what: str, expression: Any) -> Any:
-        """Return an expression; raise ValueError if it contains an unknown name."""
+        """Return text or an expression as an expression; raise ValueError if it contains an unknown name."""
+        expression = as_expression(what, given, {*self.components, *self.values})
         known = {*self.components, *self.values, "t"}
         if unknown := sorted({item.name for item in expression.free_symbols} - known):
             raise ValueError(
@@ -294,21 +284,28 @@ class _Scope:
             )
         return expression
 
+    def read_quantity(self, what: str, given: Any) -> Any:
+        """Return an expression that depends on the state."""
+        expression = self.read(what, given)
+        if not expression.has(*map(symbol, self.components)):
+            raise ValueError(
+                f"{what} is {shortened(expression)}, which does not depend on {', '.join(self.components)}."
+            )
+        return expression
+
     def added_rates(self, vector_field: Callable[[Any], Any], perturbation: Any, dissipation: Any) -> list[Any]:
         """Return the parts of y' that are due to a perturbation and dissipation."""
-        extra = sympy.Integer(0) if perturbation is None else self.read("perturbation", perturbation)
-        added, given = list(vector_field(extra)), {} if dissipation is None else dissipation
-        if not isinstance(given, Mapping):
-            raise TypeError(f"dissipation must be a mapping of components to expressions, got {shown(given)}.")
-        for component, item in zip(as_names("the keys of dissipation", list(given)), given.values(), strict=True):
-            if component not in self.components:
-                raise ValueError(
-                    f"dissipation: {component} is not a component of the state ({', '.join(self.components)})."
-                )
-            added[self.components.index(component)] += self.read(f"dissipation of {component}", item)
+        added = list(
+            vector_field(sympy.Integer(0) if perturbation is None else self.read("perturbation", perturbation))
+        )
+        given = as_mapping("dissipation", dissipation)
+        for name, item in zip(as_names("the keys of dissipation", list(given)), given.values(), strict=True):
+            if name not in self.components:
+                raise ValueError(f"dissipation: {name} is not a component of the state ({', '.join(self.components)}).")
+            added[self.components.index(name)] += self.read(f"dissipation of {name}", item)
         return added
 
-    def balances(self, given: Any, rates: Any, added: Any) -> Iterator[tuple[str, Any, Any]]:
+    def balances(self, given: Mapping[str, Any], rates: Any, added: Any) -> Iterator[tuple[str, Any, Any]]:
         """Yield the names, expressions and rates of integrals of y' = `rates` that change because of `added`."""
         equations = Equations(self.components, rates, self.values)
         for label, item in given.items():
@@ -317,52 +314,33 @@ class _Scope:
             terms = (derivative(quantity, symbol(y)) * f for y, f in zip(self.components, added, strict=True))
             yield label, quantity, sympy.Add(*terms)
 
-    def quantities(self, kept: Any, invariants: Any, constraints: Any) -> dict[str, Any]:
-        """Return the expressions of the given constraints and invariants by name; `kept` has names that are taken."""
-        for kind, items in (("invariants", invariants), ("constraints", constraints)):
-            if not isinstance(items, Mapping):
-                raise TypeError(f"{kind} must be a mapping of names to expressions, got {shown(items)}.")
-        found = {}
+    def problem(
+        self, name: Any, rates: Any, kept: Any, invariants: Any, constraints: Any, balances: Any = (), pairs: Any = ()
+    ) -> SymbolicProblem:
+        """Return the problem after checks of invariants and constraints; `kept` has invariants by construction."""
+        if not isinstance(name, str):
+            raise TypeError(f"name must be a string, got {shown(name)}.")
+        invariants, constraints = as_mapping("invariants", invariants), as_mapping("constraints", constraints)
+        quantities = {}
         for label, item in (*constraints.items(), *invariants.items()):
             if not isinstance(label, str):
                 raise TypeError(f"invariants and constraints: names must be strings, got {shown(label)}.")
-            if label in kept:
-                raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
-            if label in found:
+            if label in kept or label in quantities:
                 raise ValueError(
                     f"{label!r} is the name of a constraint and of an invariant; rename or omit one of them."
+                    if label in quantities
+                    else f"invariants: {label} is already the name of an invariant; choose another or omit it."
                 )
             what = f"{'constraint' if label in constraints else 'invariant'} {label!r}"
-            found[label] = quantity = self.read(what, item)
-            if not quantity.has(*map(symbol, self.components)):
-                raise ValueError(
-                    f"{what} is {shortened(quantity)}, which does not depend on {', '.join(self.components)}."
-                )
-        return found
-
-
-def _checked(
-    name: Any, scope: _Scope, rates: Any, kept: Any, invariants: Any, constraints: Any = None, *, balances: Any = (),
-    pairs: Any = (), hint: str = "",
-) -> SymbolicProblem:  # fmt: skip
-    """Return the problem after checks of the given invariants and constraints; `kept` holds those by construction.
-
-    Without constraints `hint` is added to the error for a quantity that is not conserved.
-    """
-    if not isinstance(name, str):
-        raise TypeError(f"name must be a string, got {shown(name)}.")
-    constraints = {} if constraints is None else constraints
-    quantities = scope.quantities(kept, {} if invariants is None else invariants, constraints)
-    zero = {label: quantities[label] for label in constraints}
-    equations, checks = Equations(scope.components, rates, scope.values, zero), dict.fromkeys(kept, "by construction")
-    for label, quantity in quantities.items():
-        try:
-            checks[label] = equations.check_conserved(label, quantity)
-        except NotConservedError as error:
-            raise NotConservedError(f"{error}{'' if zero else hint}") from None
-    everything = (*kept.items(), *quantities.items())
-    system = System(scope.components, tuple(scope.values), tuple(rates), everything, balances, tuple(zero))
-    return _problem(name, system, np.array(list(scope.values.values())) if scope.values else None, checks, pairs=pairs)
+            quantities[label] = self.read_quantity(what, item)
+        zero = {label: quantities[label] for label in constraints}
+        equations = Equations(self.components, rates, self.values, zero)
+        checks = dict.fromkeys(kept, "by construction")
+        checks |= {label: equations.check_conserved(label, quantity) for label, quantity in quantities.items()}
+        every = (*kept.items(), *quantities.items())
+        system = System(self.components, tuple(self.values), tuple(rates), every, tuple(balances), tuple(zero))
+        params = np.array(list(self.values.values())) if self.values else None
+        return _problem(name, system, params, checks, pairs=pairs)
 
 
 def _problem(
@@ -442,13 +420,10 @@ def _nonzero_slopes(system: System, name: str) -> tuple[tuple[int, Any], ...]:
 
 def parameter_values(params: Any) -> dict[str, float]:
     """Return the parameters as a mapping of names to floats; raise an error if one is not a finite number."""
-    if params is None:
-        return {}
-    if not isinstance(params, Mapping):
-        raise TypeError(f"params must be a mapping of names to values, got {shown(params)}.")
-    names = as_names("the keys of params", list(params))
-    for name, value in zip(names, params.values(), strict=True):
+    given = as_mapping("params", params)
+    names = as_names("the keys of params", list(given))
+    for name, value in zip(names, given.values(), strict=True):
         is_constant = isinstance(value, sympy.Expr) and reals("params", value) is not None
         if not ((is_number(value) or is_constant) and math.isfinite(value)):
             raise ValueError(f"params: {name} must be a finite number, got {shown(value)}.")
-    return dict(zip(names, map(float, params.values()), strict=True))
+    return dict(zip(names, map(float, given.values()), strict=True))
