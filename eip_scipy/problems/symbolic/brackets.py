@@ -17,7 +17,7 @@ import sympy
 from .parser import symbol
 from .program import Arguments, precise
 
-__all__ = ["Equations", "NotConservedError", "derivative", "drop_impulses", "sampled_states", "shortened", "vanishes"]
+__all__ = ["Equations", "NotConservedError", "derivative", "drop_impulses", "sampled_values", "shortened", "vanishes"]
 
 POINTS, TRIES = 8, 200
 ROUND_OFF = 1e-20  # bound for the rounding of a rate that is 0, relative to its terms
@@ -193,13 +193,19 @@ def _sides(difference: Callable[[Point], list[Any] | None], point: Point, places
     return []
 
 
+def sampled_values(expressions: Sequence[Any], arguments: Arguments, params: Sequence[float] = ()) -> list[list[Any]]:
+    """Return the values of expressions, with 50 digits, at random states at which all of them are finite."""
+    at, extra = precise("values", expressions, arguments), (params,) if params else ()
+    values = (at(x[-1], x[:-1], *extra) for x in sampled_states(len(arguments.y)))
+    return list(islice((found for found in values if found is not None), POINTS))
+
+
 def vanishes(expression: Any) -> bool:
     """Return True if an expression is 0, by algebra if that is quick, otherwise at random points."""
     if _expands_to_zero(expression):
         return True
-    names = tuple(sorted({item.name for item in expression.free_symbols} - {"t"}))
-    at = precise("expression", [expression], Arguments(names))
-    found = list(islice(filter(None, (at(x[-1], x[:-1]) for x in sampled_states(len(names)))), POINTS))
+    names = sorted({item.name for item in expression.free_symbols} - {"t"})
+    found = sampled_values([expression], Arguments(tuple(names)))
     return bool(found) and all(abs(value) <= ROUND_OFF for (value,) in found)
 
 

@@ -21,17 +21,14 @@ from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import MET, Names, by_name
-from .brackets import BRANCHES, drop_impulses, sampled_states
+from .brackets import BRANCHES, drop_impulses, sampled_values
 from .constrained import Constrained, acceleration, parts_of
 from .parser import TIME, as_expression, as_mapping, symbol
-from .program import function
 from .system import parameter_values
 
 __all__ = ["mechanics_of_model", "name_of"]
 
-# A row of constraints depends on the others if its remainder is below DEPENDENT, relative to the row, at POINTS points.
-DEPENDENT, POINTS = 1e-9, 3
-QUATERNION = 4  # components
+DEPENDENT = 1e-9  # a row of constraints depends on others if its remainder is below this share of the row
 LARGEST_BLOCK = 3  # of linear equations that are solved by Cramer's rule
 
 
@@ -144,9 +141,8 @@ def _require_rotations(problem: MechanicsProblem) -> None:
     """Raise ValueError if a quaternion that SymPy uses for a rotation does not have the norm 1."""
     args = () if problem.params is None else (problem.params,)
     for item in problem.norms:
-        slopes, value = np.empty(problem.y0.size), plain(item.function)(0.0, problem.y0, *args)
-        plain(item.gradient)(0.0, np.ones(problem.y0.size), slopes, *args)
-        if np.count_nonzero(slopes) == QUATERNION and not abs(value - 1) <= MET:
+        value = plain(item.function)(0.0, problem.y0, *args)
+        if str(item.name).count("^2") == 4 and not abs(value - 1) <= MET:
             raise ValueError(
                 f"mechanics: the start has {item.name} = {value:.6g}; expected 1, because the quaternion of a rotation "
                 "has norm 1. Divide its components by their norm."
@@ -305,17 +301,14 @@ def _require_different(items: Iterable[Any]) -> None:
     for item in items:
         first = known.setdefault(name := name_of(item), item)
         if first != item:
-            raise ValueError(
-                f"mechanics: two different quantities are called {name!r}: {_described(first)} and {_described(item)}. "
-                "Rename one or, if they are meant to be the same, use one of them everywhere."
+            # The representation of a symbol contains its assumptions, which make symbols different.
+            one, other = (
+                "the time" if x == TIME else sympy.srepr(x) if isinstance(x, sympy.Symbol) else x for x in (first, item)
             )
-
-
-def _described(item: Any) -> str:
-    """Return an item as text; that of a symbol contains its assumptions, which make symbols different."""
-    if item == TIME:
-        return "the time, dynamicsymbols._t"
-    return sympy.srepr(item) if isinstance(item, sympy.Symbol) else str(item)
+            raise ValueError(
+                f"mechanics: two different quantities are called {name!r}: {one} and {other}. Rename one or, if they "
+                "are meant to be the same, use one of them everywhere."
+            )
 
 
 def _momenta(found: _Model, system: Constrained, converted: _Conversion) -> Iterator[tuple[str, Any]]:
@@ -507,13 +500,9 @@ def _missing_velocities(system: Constrained, values: Mapping[str, float]) -> lis
     items = (*map(system.rate, system.positions), *system.velocities)
     n, m = len(system.speeds), len(system.positions)
     slopes = tuple(sympy.diff(item, symbol(name)) for item in items for name in system.speeds)
-    rows = plain(function("rows", slopes, system.arguments, shape=(len(items), n)))
-    params = (np.array([values[name] for name in system.parameters]),) if system.parameters else ()
     missing = np.zeros(m, bool)
-    for point in list(sampled_states(len(system.arguments.y)))[-POINTS:]:  # positive ones
-        found = np.empty((len(items), n))
-        rows(point[-1], point[:-1], found, *params)
-        own, known = found[:m], found[m:]
+    for found in sampled_values(slopes, system.arguments, [values[name] for name in system.parameters]):
+        own, known = np.split(np.array(found, float).reshape(len(items), n), [m])
         left = own - (known.T @ np.linalg.lstsq(known.T, own.T, rcond=DEPENDENT)[0]).T
         missing |= np.linalg.norm(left, axis=1) > DEPENDENT * np.linalg.norm(own, axis=1)
     return np.flatnonzero(missing).tolist()

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import keyword
-import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping
@@ -228,12 +227,8 @@ class _Reader:
 
     def _power(self, node: ast.BinOp) -> sympy.Expr:
         base, exponent = self._expression(node.left), self._expression(node.right)
-        if exponent.is_number:
-            size = abs(float(exponent))
-            if size > LARGEST_EXPONENT:
-                raise self._refuse(node.right, f"is an exponent above {LARGEST_EXPONENT} in size")
-            if base.is_number and base != 0 and size * abs(math.log(abs(float(base)))) > math.log(LARGEST):
-                raise self._refuse(node, "is too large, or too small")
+        if exponent.is_number and abs(exponent) > LARGEST_EXPONENT:
+            raise self._refuse(node.right, f"is an exponent above {LARGEST_EXPONENT} in size")
         return base**exponent
 
     def _call(self, node: ast.Call) -> sympy.Expr:

@@ -160,7 +160,7 @@ class SymbolicProblem(Problem):
 
 
 # Attributes that are made from the expressions.
-REMADE = {"fun", "rhs", "acc", "jacobian", "variational", "invariants", "canonical"}
+REMADE = {"fun", "rhs", "acc", "jacobian", "variational", "invariants"}
 
 
 def _again(kept: Sequence[Any], others: dict[str, Any]) -> SymbolicProblem:
@@ -295,10 +295,8 @@ class _Scope:
 
     def added_rates(self, vector_field: Callable[[Any], Any], perturbation: Any, dissipation: Any) -> list[Any]:
         """Return the parts of y' that are due to a perturbation and dissipation."""
-        added = list(
-            vector_field(sympy.Integer(0) if perturbation is None else self.read("perturbation", perturbation))
-        )
-        given = as_mapping("dissipation", dissipation)
+        extra = self.read("perturbation", 0 if perturbation is None else perturbation)
+        added, given = list(vector_field(extra)), as_mapping("dissipation", dissipation)
         for name, item in zip(as_names("the keys of dissipation", list(given)), given.values(), strict=True):
             if name not in self.components:
                 raise ValueError(f"dissipation: {name} is not a component of the state ({', '.join(self.components)}).")
@@ -325,12 +323,10 @@ class _Scope:
         for label, item in (*constraints.items(), *invariants.items()):
             if not isinstance(label, str):
                 raise TypeError(f"invariants and constraints: names must be strings, got {shown(label)}.")
-            if label in kept or label in quantities:
-                raise ValueError(
-                    f"{label!r} is the name of a constraint and of an invariant; rename or omit one of them."
-                    if label in quantities
-                    else f"invariants: {label} is already the name of an invariant; choose another or omit it."
-                )
+            if label in kept:
+                raise ValueError(f"invariants: {label} is already the name of an invariant; choose another or omit it.")
+            if label in quantities:
+                raise ValueError(f"{label!r} is the name of a constraint and of an invariant; rename or omit one.")
             what = f"{'constraint' if label in constraints else 'invariant'} {label!r}"
             quantities[label] = self.read_quantity(what, item)
         zero = {label: quantities[label] for label in constraints}
@@ -350,17 +346,20 @@ def _problem(
     acc, half = system.accelerations, len(system.accelerations)
     # The derivatives of abs, max and min jump.
     is_smooth = 0 < half <= LARGEST_JACOBIAN and not any(a.has(sympy.sign, sympy.Heaviside) for a in acc)
-    # A perturbed system may have friction, so that it does not count as canonical.
-    canonical = 2 * len(others.get("pairs", ())) == len(system.components) and not system.balances
-    unset = {"y0": None, "t_span": None, "component_names": system.components}  # the first two belong to a run
+    unset = {
+        "y0": None, "t_span": None,  # arguments of a run
+        "component_names": system.components, "invariants": _invariants(system, params),
+        # A perturbed system may have friction, so that it does not count as canonical.
+        "canonical": 2 * len(others.get("pairs", ())) == len(system.components) and not system.balances,
+    }  # fmt: skip
     arguments = Arguments(system.components[:half], system.parameters)
     made = {
         "name": name, "system": system, "params": params, "checks": checks, "fun": bind(rhs, params), "rhs": rhs,
         "acc": vector(function("acceleration", acc, arguments), half) if half else None,
         "jacobian": Deferred(partial(_jacobian, system)) if is_smooth else None,
-        "variational": partial(_variational, system), "canonical": canonical,
+        "variational": partial(_variational, system),
     }  # fmt: skip
-    return SymbolicProblem(**(unset | {"invariants": _invariants(system, params)} | others | made))
+    return SymbolicProblem(**(unset | others | made))
 
 
 def value_and_gradient(name: str, quantity: Any, arguments: Arguments) -> tuple[Callable[..., Any], Callable[..., Any]]:
