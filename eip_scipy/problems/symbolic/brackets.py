@@ -6,8 +6,9 @@ sides of each place at which functions such as abs and max change their branches
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import combinations, islice
 from typing import Any
 
@@ -20,9 +21,9 @@ from .program import Arguments, precise
 __all__ = ["Equations", "NotConservedError", "derivative", "drop_impulses", "sampled_values", "shortened", "vanishes"]
 
 POINTS, TRIES = 8, 200
-ROUND_OFF = 1e-20  # bound for the rounding of a rate that is 0, relative to its terms
-# With more operations, or larger powers, algebra may take minutes, while an evaluation at points takes milliseconds.
-EXPANDED_OPERATIONS, SIMPLIFIED_OPERATIONS, LARGEST_POWER = 1200, 120, 6
+ROUND_OFF = 1e-30  # bound for the rounding of a rate that is 0, relative to its terms
+# Algebra of expressions with more operations, or of powers of sums with more terms, may take minutes.
+EXPANDED_OPERATIONS, SIMPLIFIED_OPERATIONS, EXPANDED_TERMS = 1200, 120, 2000
 # Functions with branches. A change of sign is searched on this number of lines, at these places, and then bisected.
 BRANCHES = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside)
 LINES, BISECTIONS = 4, 40
@@ -55,6 +56,8 @@ class Equations:
     def __init__(self, components: Any, rates: Any, values: Mapping[str, float], constraints: Any = None) -> None:
         self.components, self.rates, self.values = tuple(components), tuple(rates), values
         self.constraints, self._variables = constraints or {}, [symbol(name) for name in (*components, "t")]
+        arguments = Arguments(self.components, tuple(values))
+        self._precise = partial(precise, arguments=arguments, params=list(values.values()))
 
     def check_conserved(self, name: str, quantity: Any) -> str:
         """Return how a quantity was shown to be conserved, such as "symbolically" or "numerically, at 8 points".
@@ -64,11 +67,13 @@ class Equations:
         or cannot be examined in all branches of functions such as max.
         """
         changes = zip(self._variables, (*self.rates, sympy.Integer(1)), strict=True)
-        terms = [term for x, change in changes if (term := sympy.diff(quantity, x) * change) != 0]
+        terms = [sympy.diff(quantity, x) * change for x, change in changes]
+        # The points are not at jumps, which are refused when the gradient is compiled.
+        terms = [x for term in terms if (x := term.replace(sympy.DiracDelta, lambda *_: sympy.Integer(0))) != 0]
         rate = sympy.Add(*terms)
         if _expands_to_zero(rate):
             return "symbolically"
-        evaluated = self._evaluated(f"rate of {name}", terms)
+        evaluated = self._precise(f"rate of {name}", terms)
 
         def count(points: Iterable[Point], most: int | None, bound: float = ROUND_OFF) -> int:
             """Return the number of points, up to `most`, at which the rate is finite; raise an error if it is not 0."""
@@ -109,12 +114,6 @@ class Equations:
             f"rate is {total}, and the absolute values of its terms sum to {size}.{hint}"
         )
 
-    def _evaluated(self, what: str, expressions: Sequence[Any]) -> Callable[[Point], list[Any] | None]:
-        """Return a function of a point that returns the values of expressions; see `precise`."""
-        values = precise(what, expressions, Arguments(self.components, tuple(self.values)))
-        params = (list(self.values.values()),) if self.values else ()
-        return lambda point: values(point[-1], point[:-1], *params)
-
     def _beside_switches(self, name: str, expressions: Sequence[Any]) -> Iterator[Point]:
         """Yield points on both sides of each place at which a max, min, abs or the like changes its branch."""
         differences: dict[Any, Any] = {}  # those whose signs choose branches, and the functions
@@ -124,7 +123,7 @@ class Equations:
             differences |= dict.fromkeys(found, atom)
         for difference, atom in differences.items():
             places = [k for k, x in enumerate(self._variables) if x in difference.free_symbols]
-            at = self._evaluated("difference", [difference])
+            at = self._precise("difference", [difference])
             lines = islice(sampled_states(len(self.components)), LINES if places else 0)
             sides = [side for point in lines for side in _sides(at, point, places)]
             if places and not (sides or difference.is_nonnegative or difference.is_nonpositive):
@@ -139,7 +138,7 @@ class Equations:
     def _constrained_points(self) -> list[Point]:
         """Return states that meet the constraints; Newton's method finds them from random states."""
         items, states = list(self.constraints.values()), self._variables[:-1]
-        both = self._evaluated("constraints", [*items, *(sympy.diff(item, x) for item in items for x in states)])
+        both = self._precise("constraints", [*items, *(sympy.diff(item, x) for item in items for x in states)])
         projected = (_projected(both, len(items), point) for point in sampled_states(len(states)))
         found = list(islice((point for point in projected if point is not None), POINTS))
         if not found:
@@ -195,8 +194,7 @@ def _sides(difference: Callable[[Point], list[Any] | None], point: Point, places
 
 def sampled_values(expressions: Sequence[Any], arguments: Arguments, params: Sequence[float] = ()) -> list[list[Any]]:
     """Return the values of expressions, with 50 digits, at random states at which all of them are finite."""
-    at, extra = precise("values", expressions, arguments), (params,) if params else ()
-    values = (at(x[-1], x[:-1], *extra) for x in sampled_states(len(arguments.y)))
+    values = map(precise("values", expressions, arguments, params), sampled_states(len(arguments.y)))
     return list(islice((found for found in values if found is not None), POINTS))
 
 
@@ -211,8 +209,9 @@ def vanishes(expression: Any) -> bool:
 
 def _is_short(expression: Any, operations: int) -> bool:
     """Return True if algebra of an expression takes at most seconds."""
-    powers = (abs(item.exp) for item in expression.atoms(sympy.Pow) if item.exp.is_Integer)
-    return max(powers, default=0) <= LARGEST_POWER and expression.count_ops() <= operations
+    powers = ((len(x.base.args), abs(x.exp)) for x in expression.atoms(sympy.Pow) if x.base.is_Add and x.exp.is_Integer)
+    terms = max((math.comb(n + int(power) - 1, n - 1) for n, power in powers), default=1)
+    return terms <= EXPANDED_TERMS and expression.count_ops() <= operations
 
 
 def _expands_to_zero(expression: Any) -> bool:

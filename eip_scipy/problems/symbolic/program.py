@@ -94,8 +94,10 @@ def function(
     return writer.function(lines, in_place)
 
 
-def precise(what: str, expressions: Sequence[Any], arguments: Arguments) -> Callable[..., list[Any] | None]:
-    """Return a function of ``(t, y[, params])`` that returns the values of expressions with 50 digits.
+def precise(
+    what: str, expressions: Sequence[Any], arguments: Arguments, params: Sequence[float] = ()
+) -> Callable[[np.ndarray], list[Any] | None]:
+    """Return a function of a point (y, t) that returns the values of expressions with 50 digits.
 
     It returns None if a value or an intermediate result is not finite and real.
     """
@@ -104,9 +106,12 @@ def precise(what: str, expressions: Sequence[Any], arguments: Arguments) -> Call
     code = writer.code([f"return [{', '.join(writer.values(expressions))}]"], in_place=False)
     call = FunctionType(code, PRECISE | {name: MP.convert(item.evalf(60)) for item, name in writer.constants.items()})
 
-    def value(t: float, *arrays: Sequence[float]) -> list[Any] | None:
+    extra = [[MP.mpf(x) for x in params]] if params else []
+
+    def value(point: np.ndarray) -> list[Any] | None:
+        *y, t = map(MP.mpf, point.tolist())
         try:
-            found = call(MP.mpf(t), *([MP.mpf(x) for x in array] for array in arrays))
+            found = call(t, y, *extra)
         except (ValueError, ArithmeticError):
             return None
         return found if all(map(MP.isfinite, found)) else None
