@@ -20,22 +20,28 @@ __all__ = ["Constrained", "acceleration", "parts_of"]
 
 
 class Constrained(NamedTuple):
-    """A system with the state (q, u): q' = `rates`, M u' + G^T lambda = F, and its constraints, all in real symbols.
+    """A system with the state (q, u): q' = `rates`, M u' + G^T lambda = F, and its constraints.
 
+    `coordinates` and `speeds` are names if the expressions are in real symbols, otherwise the model's own symbols.
     `mass` is M by rows, and `rates` are linear in the speeds. `positions` and `velocities` are the expressions that
     constraints set to 0; the latter are linear in the speeds and include the derivatives of `positions`. `inputs` are
     names of quantities in the forces that functions ``f(t, y)`` compute.
     """
 
-    coordinates: tuple[str, ...]
-    speeds: tuple[str, ...]
+    coordinates: Any
+    speeds: Any
     parameters: tuple[str, ...]
-    rates: tuple[Any, ...]
-    mass: tuple[Any, ...]
-    forces: tuple[Any, ...]
-    positions: tuple[Any, ...]
-    velocities: tuple[Any, ...]
+    rates: Any
+    mass: Any
+    forces: Any
+    positions: Any
+    velocities: Any
     inputs: tuple[tuple[str, Callable[..., float]], ...] = ()
+
+    @property
+    def expressions(self) -> tuple[Any, ...]:
+        """Return the rates, masses, forces and constraints."""
+        return self.rates, self.mass, self.forces, self.positions, self.velocities
 
     @property
     def arguments(self) -> Arguments:

@@ -41,19 +41,13 @@ def name_of(item: Any) -> str:
 
 
 class _Model(NamedTuple):
-    """A model's equations in its own symbols: q' = `rates` and `mass` u' = `forces` plus the forces of the constraints.
+    """A model, whose equations `own`, with their coordinates and speeds, are in its own symbols.
 
-    `positions` and `velocities` are the expressions that the constraints set to 0. `energies` are pairs (description,
-    expression), and `independent` is None if the model has no dependent coordinates or speeds.
+    `energies` are pairs (description, expression), and `independent` is None if the model has no dependent coordinates
+    or speeds.
     """
 
-    coordinates: list[Any]
-    speeds: list[Any]
-    rates: list[Any]
-    mass: Any
-    forces: Any
-    positions: list[Any]
-    velocities: list[Any]
+    own: Constrained
     energies: list[tuple[str, Any]]
     kinetic: Any  # the kinetic energy, or the Lagrangian
     partial_speeds: Callable[[int], Sequence[Any]]  # the derivatives of the speeds by the rate of a coordinate, or []
@@ -156,21 +150,22 @@ class _Conversion:
     """
 
     def __init__(self, found: _Model, inputs: Any, t: float, start: tuple[Any, Any]) -> None:
-        self._found, self.names = found, {item: name_of(item) for item in (*found.coordinates, *found.speeds)}
+        own = found.own
+        self._found, self.names = found, {item: name_of(item) for item in (*own.coordinates, *own.speeds)}
         self._symbols = {item: symbol(name) for item, name in self.names.items()} | {TIME: symbol("t")}
-        self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in found.speeds}
-        parts = [*found.forces, *found.positions, *found.velocities, *found.mass, *found.rates]
-        functions = set().union(*(sympy.sympify(item).atoms(AppliedUndef) for item in parts))
+        self._accelerations = {item.diff(TIME): acceleration(self.names[item]) for item in own.speeds}
+        parts = [sympy.sympify(item) for items in own.expressions for item in items]
+        functions = set().union(*(item.atoms(AppliedUndef) for item in parts))
         self._known = {name_of(item): item for item in functions}
         self._inputs: dict[Any, Any] = {}  # expressions
         self._called: dict[Any, Callable[..., float]] = {}  # functions f(t, y)
-        y = np.array([*_numbers(start[0], found.coordinates), *_numbers(start[1], found.speeds)])
+        y = np.array([*_numbers(start[0], own.coordinates), *_numbers(start[1], own.speeds)])
         for key, value in as_mapping("inputs", inputs).items():
             self._read_input(
                 [self._function(item) for item in (key if isinstance(key, tuple) else (key,))], value, t, y
             )
         self._called_names = set(map(name_of, self._called))
-        symbols = (sympy.sympify(item).free_symbols for item in (*parts, *(item for _, item in found.energies)))
+        symbols = (item.free_symbols for item in (*parts, *(sympy.sympify(item) for _, item in found.energies)))
         _require_different((TIME, *self.names, *self._called, *sorted(set().union(*symbols), key=sympy.srepr)))
 
     def _function(self, key: Any) -> Any:
@@ -243,14 +238,14 @@ class _Conversion:
 
     def system(self) -> Constrained:
         """Return the equations, whose parameters are not known yet, because outputs may have further ones."""
-        found, names = self._found, self.names
-        parts = (found.rates, found.mass, found.forces, found.positions, found.velocities)
-        rates, mass, forces, positions, velocities = (tuple(map(self, items)) for items in parts)
-        self._require_smooth("a kinematic equation", rates)
-        self._require_smooth("a constraint", (*positions, *velocities))
-        coordinates, speeds = (tuple(names[item] for item in items) for items in (found.coordinates, found.speeds))
+        own = self._found.own
+        names = (tuple(self.names[item] for item in items) for items in (own.coordinates, own.speeds))
+        expressions = (tuple(map(self, items)) for items in own.expressions)
         called = tuple((name_of(key), function) for key, function in self._called.items())
-        return Constrained(coordinates, speeds, (), rates, mass, forces, positions, velocities, called)
+        system = Constrained._make([*names, (), *expressions, called])
+        self._require_smooth("a kinematic equation", system.rates)
+        self._require_smooth("a constraint", (*system.positions, *system.velocities))
+        return system
 
     def energies(self, energy: Any, potential_energy: Any) -> Iterator[tuple[str, Any]]:
         """Yield the quantities that may be the energy.
@@ -325,7 +320,7 @@ def _momenta(found: _Model, system: Constrained, converted: _Conversion) -> Iter
         along = [(u, F) for u, F, part in zip(system.speeds, system.forces, column, strict=False) if part != 0]
         unsure = any(F.has(*BRANCHES, sympy.Piecewise) or F.free_symbols & inputs for _, F in along)
         if along and not unsure and not (len(along) == 1 and along[0][0] in constrained):
-            slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.speeds]
+            slopes = [converted(sympy.diff(found.kinetic, u)) for u in found.own.speeds]
             yield f"p_{name}", sympy.Add(*(a * b for a, b in zip(column, slopes, strict=True)))
 
 
@@ -410,21 +405,12 @@ def _of_kane(method: Any) -> _Model:
             (f"kinetic energy of the bodies and {constant}", kinetic + of_loads),
             (f"kinetic and potential energy of the bodies and {constant}", kinetic + potential + of_loads),
         ]
+    velocities = method._k_nh * sympy.Matrix(u) + method._f_nh if method._k_nh else []
+    rates = [by_speeds[item.diff(TIME)] for item in q]
+    own = Constrained(q, u, (), rates, free.mass_matrix, free.forcing, method._f_h, velocities)
     dependent = {*method._qdep, *method._udep}
-    return _Model(
-        coordinates=q,
-        speeds=u,
-        rates=[by_speeds[item.diff(TIME)] for item in q],
-        mass=free.mass_matrix,
-        forces=free.forcing,
-        positions=list(method._f_h),
-        velocities=list(method._k_nh * sympy.Matrix(u) + method._f_nh) if method._k_nh else [],
-        energies=energies,
-        kinetic=kinetic,
-        partial_speeds=partial(_kane_partial_speeds, method),
-        independent=[item for item in (*q, *u) if item not in dependent] if dependent else None,
-        by_speeds=by_speeds,
-    )
+    independent = [item for item in (*q, *u) if item not in dependent] if dependent else None
+    return _Model(own, energies, kinetic, partial(_kane_partial_speeds, method), independent, by_speeds)
 
 
 def _of_lagrange(method: Any) -> _Model:
@@ -432,18 +418,9 @@ def _of_lagrange(method: Any) -> _Model:
         method.form_lagranges_equations()
     q, L = list(method.q), method._L[0]
     speeds = [item.diff(TIME) for item in q]
-    return _Model(
-        coordinates=q,
-        speeds=speeds,
-        rates=speeds,
-        mass=method._m_d,
-        forces=method._f_d,
-        positions=list(method._hol_coneqs),
-        velocities=list(method.coneqs),
-        energies=[("of the Lagrangian", sympy.Add(*(v * sympy.diff(L, v) for v in speeds)) - L)],
-        kinetic=L,
-        partial_speeds=lambda k: [sympy.Integer(j == k) for j in range(len(q))],
-    )
+    own = Constrained(q, speeds, (), speeds, method._m_d, method._f_d, method._hol_coneqs, method.coneqs)
+    energy = sympy.Add(*(v * sympy.diff(L, v) for v in speeds)) - L
+    return _Model(own, [("of the Lagrangian", energy)], L, lambda k: [sympy.Integer(j == k) for j in range(len(q))])
 
 
 def _potential_of_loads(loads: Iterable[Any], frame: Any) -> Any:
@@ -474,7 +451,7 @@ def _fixed_point(place: Any, frame: Any) -> Any:
 
 def _with_parameters(system: Constrained, others: Sequence[Any], values: Mapping[str, float]) -> Constrained:
     """Return the system with the parameters in the equations or in `others`, in the order of `values`."""
-    items = (*system.rates, *system.mass, *system.forces, *system.positions, *system.velocities, *others)
+    items = [item for expressions in (*system.expressions, others) for item in expressions]
     known = {*system.arguments.y, "t", *(acceleration(name).name for name in system.speeds)}
     known |= {name for name, _ in system.inputs}
     if taken := sorted(values.keys() & known):
