@@ -74,7 +74,7 @@ class Arguments(NamedTuple):
     dy: tuple[str, ...] = ()
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=512)
 def function(
     what: str, expressions: tuple[Any, ...], arguments: Arguments, *, in_place: bool = True, shape: Any = None
 ) -> Callable[..., Any]:
