@@ -18,7 +18,10 @@ import sympy
 from .parser import symbol
 from .program import Arguments, precise
 
-__all__ = ["Equations", "NotConservedError", "derivative", "drop_impulses", "sampled_values", "shortened", "vanishes"]
+__all__ = [
+    "BRANCHES", "Equations", "NotConservedError", "derivative", "drop_dirac_deltas", "sampled_values", "shortened",
+    "vanishes",
+]  # fmt: skip
 
 POINTS, TRIES = 8, 200
 ROUND_OFF = 1e-30  # bound for the rounding of a rate that is 0, relative to its terms
@@ -227,10 +230,10 @@ def shortened(expression: Any, length: int = 100) -> str:
 @lru_cache(maxsize=4096)
 def derivative(expression: Any, variable: Any) -> Any:
     """Return the derivative of an expression, without impulses at places where the expression does not jump."""
-    return drop_impulses(sympy.diff(expression, variable))
+    return drop_dirac_deltas(sympy.diff(expression, variable))
 
 
-def drop_impulses(found: Any) -> Any:
+def drop_dirac_deltas(found: Any) -> Any:
     """Return a derivative without impulses whose factor is 0 where they occur.
 
     SymPy's derivative of q**2 sign(q) contains q**2 DiracDelta(q), which is 0. An impulse that remains belongs to a

@@ -21,7 +21,7 @@ from ..multibody.motion import plain
 from ..multibody.parts import required_outputs
 from ..multibody.problem import MechanicsProblem, mechanics_problem
 from ..multibody.start import MET, Names, by_name
-from .brackets import BRANCHES, drop_impulses, sampled_values
+from .brackets import BRANCHES, drop_dirac_deltas, sampled_values
 from .constrained import Constrained, acceleration, parts_of
 from .parser import TIME, as_expression, as_mapping, symbol
 from .system import parameter_values
@@ -214,7 +214,7 @@ class _Conversion:
         own = {*self._symbols.values(), *self._accelerations.values()}
         expression = expression.xreplace({item: symbol(name_of(item)) for item in left})
         expression = expression.xreplace({item: symbol(name_of(item)) for item in expression.free_symbols - own})
-        return drop_impulses(expression)
+        return drop_dirac_deltas(expression)
 
     def _unknown(self, item: Any) -> ValueError:
         inner = item.expr if isinstance(item, sympy.Derivative) else item

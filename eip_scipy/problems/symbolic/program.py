@@ -105,7 +105,6 @@ def precise(
     writer.checks = []  # arrays are lists
     code = writer.code([f"return [{', '.join(writer.values(expressions))}]"], in_place=False)
     call = FunctionType(code, PRECISE | {name: MP.convert(item.evalf(60)) for item, name in writer.constants.items()})
-
     extra = [[MP.mpf(x) for x in params]] if params else []
 
     def value(point: np.ndarray) -> list[Any] | None:

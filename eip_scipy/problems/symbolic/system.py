@@ -30,10 +30,9 @@ LARGEST_JACOBIAN = 16  # number of coordinates; the Jacobian has its square of e
 
 
 class System(NamedTuple):
-    """Equations and their invariants and balances as expressions.
+    """Equations, their invariants (name, expression) and balances (name, expression, rate).
 
-    `invariants` holds pairs (name, expression), `balances` triples (name, expression, rate), and `constraints` the
-    names of the invariants that are 0.
+    `constraints` has the names of the invariants that are 0.
     """
 
     components: tuple[str, ...]
@@ -87,16 +86,8 @@ class SymbolicProblem(Problem):
     def second_order(self) -> SymbolicProblem:
         """Return the problem in (q, v) with v = q', as Nystrom methods need it, if H is p W p / 2 + V(t, q).
 
-        Returns
-        -------
-        SymbolicProblem
-            A problem without start and interval. The velocity of a coordinate ``x`` is called ``v_x``.
-
-        Raises
-        ------
-        ValueError
-            If q' is not a constant invertible matrix W times p, p' depends on p, or the state does not consist of pairs
-            of coordinates and momenta.
+        The velocity of a coordinate ``x`` is called ``v_x``. A ValueError is raised if q' is not a constant invertible
+        matrix W times p, p' depends on p, or the state does not consist of pairs of coordinates and momenta.
         """
         names, rates, half, W = self.system.components, self.system.rates, len(self.pairs), self._inverse_mass_matrix()
         if W is None:
@@ -175,7 +166,10 @@ def hamiltonian_problem(
     values = parameter_values(params)
     declared = {*values, *(item for given in (q, p) if given is not None for item in as_names("q and p", given))}
     energy, time = as_expression("H", H, declared), symbol("t")
-    names, pairs, B = _canonical(energy, q, p, values) if poisson is None else _lie_poisson(q, p, poisson, declared)
+    if poisson is None:
+        names, pairs, B = _canonical_structure(energy, q, p, values)
+    else:
+        names, pairs, B = _poisson_structure(q, p, poisson, declared)
     scope = _Scope(names, values)
     scope.read_quantity("H", energy)
 
@@ -229,7 +223,7 @@ def equations_problem(
         raise NotConservedError(f"{error}{hint}") from None
 
 
-def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
+def _canonical_structure(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tuple[Any, Any, Any]:
     """Return the names of the components (q, p), the pairs of names, and the matrix B of y' = B grad H.
 
     If neither q nor p is given, the pairs are found from the names in H that are not keys of `values`.
@@ -248,7 +242,7 @@ def _canonical(energy: Any, q: Any, p: Any, values: Mapping[str, float]) -> tupl
     return as_names("q and p", (*q, *p)), tuple(zip(q, p, strict=True)), sympy.Matrix([[zero, one], [-one, zero]])
 
 
-def _lie_poisson(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
+def _poisson_structure(y: Any, p: Any, poisson: Any, declared: set[str]) -> tuple[Any, Any, Any]:
     """Return the names of the components, no pairs, and the matrix B of y' = B grad H."""
     if y is None or p is not None:
         raise TypeError("hamiltonian: with poisson= give the names of the whole state as q, and omit p.")
