@@ -39,16 +39,14 @@ def hamiltonian(
     ----------
     H : str or sympy.Expr
         The Hamiltonian. Text is read as Python's arithmetic of numbers, names, pi and functions such as sqrt and cos,
-        by a parser that does not execute it. You can use every name except t, the time, including E, I, S, N, beta and
-        gamma. Names of coordinates, momenta or parameters that you declare have precedence: if pi is declared, it is
-        not the number.
+        by a parser that does not execute it. You can use every name except t, the time; a declared coordinate, momentum
+        or parameter pi is not the number.
     q, p : str or sequence, optional
         Names of coordinates and momenta, as text such as ``"q1 q2"`` or a list, or SymPy symbols. The state is (q, p).
-        Default: the names in `H` that are not parameters, paired as x with px, q1 with p1, theta with p_theta and so
-        on; the repr of the result shows the pairs.
+        Default: the names in `H` that are not parameters, paired as x with px, q1 with p1, theta with p_theta; the repr
+        of the result shows the pairs.
     params : mapping, optional
-        Values of the constants by name. ``problem.params`` and the rows of ``params`` for `ensemble` have the order of
-        this mapping.
+        Values of the constants by name. ``problem.params`` and the rows of ``params`` for `ensemble` have its order.
     invariants : mapping, optional
         Expressions of further invariants by name; each is checked by its Poisson bracket with H.
     name : str, optional
@@ -61,12 +59,10 @@ def hamiltonian(
     perturbation : str or sympy.Expr, optional
         A second Hamiltonian, which may depend on t: the equations are those of the sum of both.
     dissipation : mapping, optional
-        Expressions that are added to the derivatives of components, by the components' names: ``{"p": "-c*p"}`` for
-        friction.
+        Expressions that are added to the derivatives of components, by name: ``{"p": "-c*p"}`` for friction.
     balances : mapping, optional
-        Expressions, by name, of integrals of `H` alone, each checked by its Poisson bracket with H. With a perturbation
-        or dissipation they become balances. Their rates consist of the bracket with the perturbation and the change by
-        the dissipation; the bracket with H is 0. Default: H itself.
+        Expressions, by name, of integrals of `H` alone, by default H itself. With a perturbation or dissipation they
+        become balances, with the rates that are due to these.
 
     Returns
     -------
@@ -95,10 +91,12 @@ def hamiltonian(
     True
     """
     with _sympy("hamiltonian"):
-        from .system import Perturbed, hamiltonian_problem
+        from .system import hamiltonian_problem
 
-        perturbed = Perturbed(perturbation, dissipation, balances)
-        return hamiltonian_problem(H, q, p, params, invariants, name, poisson, extended, perturbed)
+        added = perturbation, dissipation, balances
+        return hamiltonian_problem(
+            H, q, p, poisson=poisson, extended=extended, added=added, params=params, invariants=invariants, name=name
+        )
 
 
 def equations(
@@ -139,21 +137,15 @@ def equations(
 
     Examples
     --------
-    >>> from eip_scipy import equations
-    >>> spin = {"m1": "m2*m3*(1/I3 - 1/I2)", "m2": "m3*m1*(1/I1 - 1/I3)", "m3": "m1*m2*(1/I2 - 1/I1)"}
-    >>> keeps = {"energy": "(m1**2/I1 + m2**2/I2 + m3**2/I3)/2", "|m|^2": "m1**2 + m2**2 + m3**2"}
-    >>> problem = equations(spin, params={"I1": 1.0, "I2": 2.0, "I3": 3.0}, invariants=keeps)
-    >>> problem.checks
-    {'energy': 'symbolically', '|m|^2': 'symbolically'}
-
     A pendulum in Cartesian coordinates, whose constraints are kept only where both of them hold:
 
+    >>> from eip_scipy import equations
     >>> motion = {"x": "u", "y": "v", "u": "-s*x", "v": "-s*y - 9.81"}
     >>> motion = {k: f.replace("s", "(u**2 + v**2 - 9.81*y)") for k, f in motion.items()}
     >>> pendulum = equations(motion, constraints={"length": "x**2 + y**2 - 1", "rate": "x*u + y*v"},
     ...                      invariants={"energy": "(u**2 + v**2)/2 + 9.81*y"})
-    >>> pendulum.checks["length"], pendulum.checks["energy"]
-    ('numerically, at 8 points that meet the constraints', 'numerically, at 8 points that meet the constraints')
+    >>> pendulum.checks["energy"]
+    'numerically, at 8 points that meet the constraints'
     """
     with _sympy("equations"):
         from .system import equations_problem
@@ -180,8 +172,7 @@ def mechanics(
     """Return the problem of a model of sympy.physics.mechanics.
 
     Its state is (q, u). A run keeps the constraints on positions and velocities, the norms of quaternions, the momenta
-    of cyclic coordinates, and the energy if it is constant or changes slowly. The problem's repr lists these
-    quantities.
+    of cyclic coordinates, and the energy if it is constant or changes slowly; see the problem's repr.
 
     Parameters
     ----------
@@ -197,11 +188,11 @@ def mechanics(
     t_span : tuple of float, optional
         Start and end of the interval. If it is omitted, the start is at t = 0.
     inputs : mapping, optional
-        Values of the functions of time in the model that are neither coordinates nor speeds. The keys are these
-        functions, their names, or tuples of them. The values are numbers, expressions of t and the state, or functions
-        ``f(t, y)`` of the state y = (q, u), which return one number for each function in the key. A function is called
-        by the right-hand side, and may occur in forces only; the problem is compiled if the function is jitted by
-        Numba. Default: ``model.specifieds`` of PyDy, whose functions have the arguments (y, t).
+        Values of the functions of time in the model that are neither coordinates nor speeds, by these functions, their
+        names, or tuples of them: numbers, expressions of t and the state, or functions ``f(t, y)`` of y = (q, u), which
+        return one number for each function in the key. A function may occur in forces only; the problem is compiled if
+        the function is jitted by Numba. Default: ``model.specifieds`` of PyDy, whose functions have the arguments
+        (y, t).
     energy : sympy.Expr, optional
         The total energy. Default: the energy of the bodies, or that of the Lagrangian, plus the potential of constant
         loads if the sum is constant.
@@ -231,11 +222,10 @@ def mechanics(
 
     Notes
     -----
-    Dependent speeds of a KanesMethod are not eliminated: its equations are formed again with all speeds independent,
-    and the constraints get Lagrange multipliers. This avoids poles at states where the choice of dependent speeds is
-    singular, and gives the forces of the constraints, see ``problem.multipliers``. KanesMethod ignores a configuration
-    constraint without its velocity constraint. If the model lacks such a velocity constraint, it is added, and the repr
-    has a note about it.
+    The equations of a KanesMethod are formed again with all speeds independent, and the constraints get Lagrange
+    multipliers, see ``problem.multipliers``: the model's own equations have poles where its choice of dependent speeds
+    is singular. KanesMethod ignores a configuration constraint without its velocity constraint; the latter is then
+    added, and the repr has a note about it.
 
     Examples
     --------
@@ -252,21 +242,8 @@ def mechanics(
     with _sympy("mechanics"):
         from .models import mechanics_of_model
 
-        return mechanics_of_model(
-            model,
-            params,
-            q0,
-            u0,
-            t_span=t_span,
-            inputs=inputs,
-            energy=energy,
-            potential_energy=potential_energy,
-            outputs=outputs,
-            independent=independent,
-            rank_tolerance=rank_tolerance,
-            name=name,
-            others=others,
-        )
+        others |= {"t_span": t_span, "independent": independent, "tolerance": rank_tolerance, "name": name}
+        return mechanics_of_model(model, params, (q0, u0), inputs, (energy, potential_energy), outputs, **others)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from sympy.core.function import AppliedUndef
 
 from .parser import TIME, as_names
 
-__all__ = ["Timed", "paired"]
+__all__ = ["paired", "without_derivatives"]
 
 # Coordinates whose momenta may occur alone in H: a coordinate that H does not depend on is cyclic.
 KNOWN = ("x", "y", "z", "r", "rho", "theta", "phi", "psi", "X", "Y", "Z", "R")
@@ -25,15 +25,15 @@ def paired(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     has no partner.
     """
     free = set(names)
-    pairs = []
-    for momentum in sorted(free, key=_natural):
-        coordinate = _coordinate(momentum, free)
-        if coordinate is not None:
-            pairs.append((coordinate, momentum))
+    found = {name: _coordinate(name, free) for name in sorted(free, key=_natural)}
+    pairs = [(q, p) for p, q in found.items() if q is not None]
     left = sorted(free - {name for pair in pairs for name in pair}, key=_natural)
-    if "p" in left and (coordinate := _partner_of_p([name for name in left if name != "p"])) is not None:
-        pairs.append((coordinate, "p"))
-        left = [name for name in left if name not in ("p", coordinate)]
+    if "p" in left:
+        others = [name for name in left if name != "p"]
+        likely = ["q"] if "q" in others or not others else [name for name in others if name in KNOWN] or others
+        if len(likely) == 1:
+            pairs.append((likely[0], "p"))
+            left = [name for name in others if name != likely[0]]
     if left or not pairs:
         raise ValueError(_unpaired(left, pairs))
     pairs.sort(key=lambda pair: _natural(pair[0]))
@@ -45,13 +45,12 @@ def _unpaired(left: list[str], pairs: list[tuple[str, str]]) -> str:
     rule = "Names are paired as x with px, q1 with p1, theta with p_theta; others by hamiltonian(H, 'a b', 'pa pb')."
     if not left:
         return f"hamiltonian: H contains neither coordinates nor momenta. {rule}"
-    are = "is" if len(left) == 1 else "are"
+    are, them = ("is", "it") if len(left) == 1 else ("are", "them")
     known = "; ".join(f"{q} with {p}" for q, p in pairs) or "none"
     values = ", ".join(f"{name!r}: 1.0" for name in left)
     return (
         f"hamiltonian: it is not clear what {' and '.join(left)} {are}: no coordinate or momentum among the names of H "
-        f"goes with {'it' if len(left) == 1 else 'them'} (pairs found: {known}). A constant needs a value: "
-        f"params={{{values}}}. {rule}"
+        f"goes with {them} (pairs found: {known}). A constant needs a value: params={{{values}}}. {rule}"
     )
 
 
@@ -61,17 +60,9 @@ def _coordinate(momentum: str, free: set[str]) -> str | None:
         return None
     rest = momentum[1:].removeprefix("_")
     if rest.isdigit():
-        likely = (f"q{momentum[1:]}", f"q{rest}", f"x{momentum[1:]}", f"x{rest}")
+        likely = [f"{letter}{digits}" for letter in "qx" for digits in (momentum[1:], rest)]
         return next((name for name in likely if name in free), likely[0])
     return rest if rest in free or rest in KNOWN or (momentum.startswith("p_") and rest.isidentifier()) else None
-
-
-def _partner_of_p(others: list[str]) -> str | None:
-    """Return q, the only usual name of a coordinate, or the only name among `others`; None if that is not clear."""
-    if "q" in others or not others:
-        return "q"
-    likely = [name for name in others if name in KNOWN] or others
-    return likely[0] if len(likely) == 1 else None
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -79,70 +70,55 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-class Timed:
-    """Names of the components of a state, and the `values` of their derivatives; components may be functions of time.
+def without_derivatives(f: Any, y: Any, *others: Any) -> tuple[tuple[str, ...], list[Any], list[Any]]:
+    """Return the names of the components, their derivatives, and mappings of further expressions, for `equations`.
 
-    A derivative that is a component itself, such as x' in the state (x, x'), is called ``v_x``. Any other derivative of
-    a component is replaced by its right-hand side; a call with an expression makes these replacements in it. `f` and
-    `y` are the arguments of `equations`.
+    Components may be functions of time. A derivative that is a component itself, such as x' in the state (x, x'), is
+    called ``v_x``. Any other derivative of a component is replaced by its right-hand side. `f` and `y` are the
+    arguments of `equations`.
     """
+    keys = list(f) if isinstance(f, Mapping) else []
+    if y is None and not isinstance(f, Mapping):
+        raise TypeError("equations: y is missing; give the names of the components, or f as a mapping by names.")
+    if isinstance(y, str):
+        y = y.replace(",", " ").split()
+    given = [key.expr if _is_rate(key) and key.expr not in keys else key for key in keys] if y is None else _listed(y)
+    speeds = {item: _speed(item) for item in given if isinstance(item, sympy.Derivative)}
+    names = as_names("the keys of f" if y is None else "y", [speeds.get(item, item) for item in given])
+    values = _listed(f.values() if isinstance(f, Mapping) else f)
+    if isinstance(f, Mapping):
+        whole = [key.expr if _is_rate(key) and key not in given else key for key in keys]
+        found = as_names("the keys of f", [speeds.get(key, key) for key in whole])
+        if set(found) != set(names):
+            raise ValueError(f"equations: f has derivatives of {', '.join(found)}, but y is {', '.join(names)}.")
+        values = [values[found.index(name)] for name in names]
+    if len(values) != len(names):
+        raise ValueError(f"equations: {len(values)} derivatives for the {len(names)} components {', '.join(names)}.")
+    own = {item: sympy.Symbol(name) for item, name in speeds.items()}
+    rates = {
+        item.diff(TIME): value.xreplace(own)
+        for item, value in zip(given, values, strict=True)
+        if isinstance(item, AppliedUndef | sympy.Derivative)
+        and isinstance(value, sympy.Expr)
+        and item.diff(TIME) not in own
+    }
 
-    def __init__(self, f: Any, y: Any) -> None:
-        keys = list(f) if isinstance(f, Mapping) else None
-        if y is not None:
-            given = y.replace(",", " ").split() if isinstance(y, str) else _listed(y)
-        elif keys is not None:
-            given = [key.expr if _is_rate(key) and key.expr not in keys else key for key in keys]
-        else:
-            raise TypeError("equations: y is missing; give the names of the components, or f as a mapping by names.")
-        self._speeds = {item: _speed(item) for item in given if isinstance(item, sympy.Derivative)}
-        self.names = as_names("the keys of f" if y is None else "y", [self._speeds.get(item, item) for item in given])
-        values = list(f.values()) if isinstance(f, Mapping) else _listed(f)
-        if keys is not None:
-            whole = [key.expr if _is_rate(key) and key not in given else key for key in keys]
-            found = [self._speeds.get(key, key) for key in whole]
-            by_name = dict(zip(as_names("the keys of f", found), values, strict=True))
-            if set(by_name) != set(self.names):
-                raise ValueError(
-                    f"equations: f has derivatives of {', '.join(by_name)}, but y is {', '.join(self.names)}."
-                )
-            values = [by_name[name] for name in self.names]
-        if len(values) != len(self.names):
-            raise ValueError(
-                f"equations: {len(values)} derivatives for the {len(self.names)} components {', '.join(self.names)}."
-            )
-        self._rates = {
-            sympy.Derivative(item, TIME): value
-            for item, value in zip(given, values, strict=True)
-            if isinstance(item, AppliedUndef) and sympy.Derivative(item, TIME) not in self._speeds
-        }
-        self._rates |= {item.diff(TIME): f for item, f in zip(given, values, strict=True) if item in self._speeds}
-        self.values = [self(value) for value in values]
-
-    def __call__(self, expression: Any) -> Any:
-        """Return an expression with the derivatives of components replaced; return text and numbers unchanged."""
-        if not isinstance(expression, sympy.Expr):
-            return expression
-        expression = self._with_speeds(expression)
-        expressions = {
-            key: self._with_speeds(value) for key, value in self._rates.items() if isinstance(value, sympy.Expr)
-        }
-        for _ in expressions:
-            if not expression.has(sympy.Derivative):
-                break
-            expression = expression.xreplace(expressions)
+    def replaced(expression: Any) -> Any:
+        if isinstance(expression, sympy.Expr):
+            expression = expression.xreplace(own)
+            for _ in rates:  # a right-hand side may contain the derivative of another component
+                expression = expression.xreplace(rates)
         return expression
 
-    def _with_speeds(self, expression: Any) -> Any:
-        return expression.xreplace({item: sympy.Symbol(name) for item, name in self._speeds.items()})
+    mapped = [{k: replaced(v) for k, v in x.items()} if isinstance(x, Mapping) else x for x in others]
+    return names, [replaced(value) for value in values], mapped
 
 
 def _listed(given: Any) -> list[Any]:
-    return [given] if isinstance(given, (str, sympy.Expr)) else list(given)
+    return [given] if isinstance(given, str | sympy.Expr) else list(given)
 
 
 def _is_rate(key: Any) -> bool:
-    """Return True if `key`, a key of the mapping `f` of `Timed`, is a first derivative with respect to time."""
     return isinstance(key, sympy.Derivative) and key.variables == (TIME,)
 
 

@@ -1,376 +1,298 @@
-"""Functions from SymPy expressions: each statement has one operation, and common subexpressions are computed once.
+"""Programs that compute SymPy expressions: statements of one operation each, none of which occurs twice.
 
-A function is compiled from a tree of `ast` nodes. No text of the user is executed, unlike in SymPy's `lambdify`, which
-writes source that contains the user's names and calls `exec`. The nodes are assignments of sums, products, powers,
-choices and calls of functions in the lists below, checks of array sizes, and in `variational` a loop over the columns.
-The names are those of the arguments, `k`, and `v` and `d` with a number; everything else is a number.
+A program is text that contains no name of a user: its names are the arguments, variables v0, v1, ..., constants c0,
+c1, ... and functions. It runs with three sets of functions: those of math, compiled by Numba; those of NumPy without
+Numba; and those of mpmath with 50 digits, by which conserved quantities are examined.
 """
 
 from __future__ import annotations
 
-import ast
 import builtins
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import reduce
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache, reduce
 from types import CodeType, FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
+import mpmath
 import numpy as np
 import sympy
 
 from ...core.functions import compilable, is_jitted, jitted
-from .parser import cbrt, with_powers_of_roots
+from .parser import LARGEST, cbrt, symbol, with_powers_of_roots
 
-__all__ = ["Arguments", "function", "variational"]
+__all__ = ["Arguments", "function", "precise", "variational"]
 
-# SymPy's functions and their names, which are the same in math and NumPy.
-CALLS: dict[Any, str] = {
-    getattr(sympy, name): name
-    for name in (
-        "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh",
-        "atanh",
-    )
+NAMES = (
+    "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh",
+    "atanh",
+)  # fmt: skip
+OPERATIONS = {getattr(sympy, name): f"{name}({{0}})" for name in NAMES} | {
+    sympy.atan2: "atan2({0}, {1})", sympy.Abs: "abs({0})", sympy.erf: "erf({0})",
+    sympy.sec: "1.0 / cos({0})", sympy.csc: "1.0 / sin({0})", sympy.cot: "1.0 / tan({0})",
+    sympy.sign: "1.0 if {0} > 0.0 else -1.0 if {0} < 0.0 else 0.0",
+    sympy.Heaviside: "1.0 if {0} > 0.0 else 0.0 if {0} < 0.0 else 0.5",
+    cbrt: "copysign(abs({0}) ** third, {0})",
+    sympy.Lt: "{0} < {1}", sympy.Le: "{0} <= {1}", sympy.Gt: "{0} > {1}", sympy.Ge: "{0} >= {1}",
+    sympy.Eq: "{0} == {1}", sympy.Ne: "{0} != {1}", sympy.Not: "not {0}",
 }  # fmt: skip
-# Functions that are reciprocals of others.
-RECIPROCALS: dict[Any, str] = {sympy.sec: "cos", sympy.csc: "sin", sympy.cot: "tan"}
-COMPARISONS: dict[Any, type[ast.cmpop]] = {
-    sympy.Lt: ast.Lt, sympy.Le: ast.LtE, sympy.Gt: ast.Gt, sympy.Ge: ast.GtE, sympy.Eq: ast.Eq, sympy.Ne: ast.NotEq,
-}  # fmt: skip
-OTHERS = (sympy.Abs, sympy.Max, sympy.Min, sympy.sign, sympy.Heaviside, sympy.erf, cbrt, sympy.Piecewise, *RECIPROCALS)
-ROOTS = ("sqrt", "copysign")  # functions of roots, which have these names in both libraries
-COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")} | {"erf": math.erf}
-COMPILED = {name: getattr(math, name) for name in (*ROOTS, *CALLS.values())} | COMMON
-# Functions for runs without Numba. They are NumPy's because those of math raise an error outside their domain, while
-# the NaN of NumPy's functions shortens the step.
-INTERPRETED = {name: getattr(np, name) for name in (*ROOTS, *CALLS.values())} | COMMON
-# The choice by the sign of a value, with numbers for a negative value, and for 0 or NaN.
-BY_SIGN = "1.0 if value > 0.0 else {} if value < 0.0 else {}"
-LARGEST_PRODUCT = 64  # largest exponent of a power that is computed by multiplications
+# Operations on two values at a time.
+CHAINS = {sympy.Max: "max({}, {})", sympy.Min: "min({}, {})", sympy.And: "{} and {}", sympy.Or: "{} or {}"}
+SUPPORTED = ", ".join(sorted(item.__name__ for item in (*OPERATIONS, *CHAINS, sympy.Piecewise)))
+LARGEST_PRODUCT = 64  # largest exponent of a square root that is computed by multiplications
+
+COMMON = {name: getattr(builtins, name) for name in ("abs", "max", "min", "range", "ValueError")}
+COMMON |= {"erf": math.erf, "nan": math.nan, "third": 1 / 3}
+COMPILED = COMMON | {name: getattr(math, name) for name in ("sqrt", "copysign", *NAMES)}
+# The functions of math raise an error outside their domain; the NaN of NumPy's shortens the step.
+INTERPRETED = COMMON | {name: getattr(np, name) for name in ("sqrt", "copysign", *NAMES)}
+MP = mpmath.MPContext()
+MP.dps, MP.trap_complex = 50, True  # roots and logarithms of negative numbers raise an error
 
 
-class Arguments:
+def _bounded(name: str) -> Callable[..., Any]:
+    """Return a function of mpmath with an error for values above 1e300: a sine of a tower of powers takes hours."""
+    function = getattr(MP, name)
+
+    def value(*x: Any) -> Any:
+        if not abs(found := function(*x)) < LARGEST:
+            raise OverflowError
+        return found
+
+    return value
+
+
+PRECISE = COMMON | {name: _bounded(name) for name in ("sqrt", "erf", *NAMES)}
+PRECISE |= {"third": MP.mpf(1) / 3, "copysign": lambda x, y: x * MP.sign(y)}
+
+
+class Arguments(NamedTuple):
     """Names of the entries of the arrays that a function reads: y, params, and dy, the direction of a derivative."""
 
-    def __init__(self, components: Sequence[str], parameters: Sequence[str], directions: Sequence[str] = ()) -> None:
-        self.arrays = {"y": tuple(components), "dy": tuple(directions), "params": tuple(parameters)}
-
-    @property
-    def places(self) -> dict[str, tuple[str, int | None]]:
-        """Return for each name the name of its array and its index in this array; for the time, ("t", None)."""
-        places = {name: (array, k) for array, names in self.arrays.items() for k, name in enumerate(names)}
-        return {**places, "t": ("t", None)}
+    y: tuple[str, ...]
+    params: tuple[str, ...] = ()
+    dy: tuple[str, ...] = ()
 
 
+@lru_cache(maxsize=512)
 def function(
-    what: str,
-    expressions: Sequence[Any],
-    arguments: Arguments,
-    *,
-    in_place: bool,
-    places: Sequence[Any] | None = None,
+    what: str, expressions: tuple[Any, ...], arguments: Arguments, *, in_place: bool = True, shape: Any = None
 ) -> Callable[..., Any]:
     """Return a function of ``(t, y[, dy][, out][, params])``, jitted if Numba is installed.
 
-    It fills `out` with the values of the expressions if `in_place`, otherwise it returns the value of the only one.
-    `places` are the places of the expressions in `out`, indices or tuples of them, by default 0, 1, ...; the other
-    entries become 0. `what` describes the values in tracebacks and errors. A ValueError is raised if an expression
-    contains a function that is not supported.
+    It fills `out` with the values of the expressions if `in_place`, otherwise it returns the value of the only one. If
+    the `shape` of `out` is given, most expressions may be 0, for which there are no statements. `what` describes the
+    values in tracebacks and errors. A ValueError is raised if an expression contains a function that is not supported.
     """
-    return _fastest(_compiled(what, _statements(what, expressions, arguments, in_place, places), arguments, in_place))
+    writer = _Writer(what, arguments)
+    places = [k for k, item in enumerate(expressions) if shape is None or item != 0]
+    values = writer.values([expressions[k] for k in places])
+    lines = [] if shape is None else ["out[:] = 0.0"]
+    for k, value in zip(places, values, strict=True):
+        index = np.unravel_index(k, shape or (len(expressions),))
+        lines.append(f"out[{', '.join(map(str, index))}] = {value}" if in_place else f"return {value}")
+    return writer.function(lines, in_place)
 
 
+def precise(
+    what: str, expressions: Sequence[Any], arguments: Arguments, params: Sequence[float] = ()
+) -> Callable[[np.ndarray], list[Any] | None]:
+    """Return a function of a point (y, t) that returns the values of expressions with 50 digits.
+
+    It returns None if a value or an intermediate result is not finite and real.
+    """
+    writer = _Writer(what, arguments)
+    writer.checks = []  # arrays are lists
+    code = writer.code([f"return [{', '.join(writer.values(expressions))}]"], in_place=False)
+    call = FunctionType(code, PRECISE | {name: MP.convert(item.evalf(60)) for item, name in writer.constants.items()})
+    extra = [[MP.mpf(x) for x in params]] if params else []
+
+    def value(point: np.ndarray) -> list[Any] | None:
+        *y, t = map(MP.mpf, point.tolist())
+        try:
+            found = call(t, y, *extra)
+        except (ValueError, ArithmeticError):
+            return None
+        return found if all(map(MP.isfinite, found)) else None
+
+    return value
+
+
+@lru_cache(maxsize=64)
 def variational(
-    what: str,
-    rates: Sequence[Any],
-    jacobian: Mapping[tuple[int, int], Any],
-    by_parameters: Sequence[Mapping[int, Any]],
+    rates: tuple[Any, ...],
+    jacobian: tuple[tuple[int, int, Any], ...],
+    by_parameters: tuple[tuple[tuple[int, Any], ...], ...],
     arguments: Arguments,
 ) -> Callable[..., None]:
     """Return a function of ``(t, Y, out[, params])`` that fills `out` with dY/dt.
 
     Y is the state, n numbers, followed by columns of derivatives, n numbers each. The rates of the state agree bit by
-    bit with those of ``function(what, rates, ...)``, because their statements come first, and the columns use their
-    intermediate results. `jacobian` holds the nonzero derivatives of the rates by row and column. `by_parameters`
-    holds, for each of the last columns, the nonzero derivatives of the rates with respect to its parameter, by row.
+    bit with those of `function`, because their statements come first. `jacobian` holds the nonzero derivatives of the
+    rates as (row, column, expression). `by_parameters` holds, for each of the last columns, those with respect to its
+    parameter as (row, expression).
     """
-    n = len(rates)
-    writer = Writer(what, arguments)
-    values = writer.values(rates)
-    derivatives = [*jacobian.values(), *(item for column in by_parameters for item in column.values())]
-    found = iter(writer.values(derivatives))
-    entries = {place: next(found) for place in jacobian}
-    added = [{row: next(found) for row in column} for column in by_parameters]
-    columns = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {len(added)} columns"
-    body = _written(
-        f"""
-if y.size % {n} != 0 or y.size < {n * (len(added) + 1)}:
-    raise ValueError(columns)
-if out.size != y.size:
-    raise ValueError("out must be as long as y")
-""",
-        columns=ast.Constant(value=columns),
-    )
-    body += [*_checks(Arguments((), arguments.arrays["params"])), *writer.body]
-    for k, value in enumerate(values):
-        body += _written(f"out[{k}] = value", value=value)
-    (loop,) = _written(f"for k in range({n}, y.size, {n}): pass")
-    loop.body = _products(n, entries)  # type: ignore[attr-defined]
-    body.append(loop)
-    for behind, column in enumerate(reversed(added), 1):
-        for row, value in column.items():
-            body += _written(f"out[y.size - {behind * n} + {row}] += value", value=value)
-    return _fastest(_compiled(what, body, arguments, in_place=True))
+    n, count, writer = len(rates), len(by_parameters), _Writer("variational equations", arguments)
+    state = writer.values(rates)
+    slopes = iter(writer.values([item for *_, item in (*jacobian, *(x for column in by_parameters for x in column))]))
+    products: dict[int, list[str]] = {i: [] for i in range(n)}
+    for i, j, _ in jacobian:
+        products[i].append(f"{next(slopes)} * d{j}")
+    text = f"y must hold the state and columns of derivatives, {n} numbers each, and at least {count} columns"
+    writer.checks = [
+        f"if y.size % {n} != 0 or y.size < {n * (count + 1)}: raise ValueError({text!r})",
+        "if out.size != y.size: raise ValueError('out must be as long as y')",
+        *_checks(arguments._replace(y=())),
+    ]
+    lines = [
+        *(f"out[{i}] = {x}" for i, x in enumerate(state)),
+        f"for k in range({n}, y.size, {n}):",
+        # The column of y is read first, because compiled code would read it again after each number that it writes.
+        *(f"    d{j} = y[k + {j}]" for j in sorted({j for _, j, _ in jacobian})),
+        *(f"    out[k + {i}] = {' + '.join(terms) or 0.0}" for i, terms in products.items()),
+    ]
+    for behind, column in zip(range(count, 0, -1), by_parameters, strict=True):
+        lines += [f"out[y.size - {behind * n - i}] += {next(slopes)}" for i, _ in column]
+    return writer.function(lines)
 
 
-def _fastest(code: CodeType) -> Callable[..., Any]:
-    fast = jitted(compilable(_made(code, COMPILED)))
-    return fast if is_jitted(fast) else _made(code, INTERPRETED)
+def _checks(arguments: Arguments) -> list[str]:
+    """Return statements that check the sizes of arrays, because compiled code does not check indices."""
+    lines = []
+    for array, names in arguments._asdict().items():
+        text = f"{array} must hold as many numbers as there are names in ({', '.join(names)}): {len(names)}"
+        lines += [f"if {array}.size != {len(names)}: raise ValueError({text!r})"] * bool(names)
+    return lines
 
 
-def _made(code: CodeType, functions: Mapping[str, Any]) -> FunctionType:
-    return FunctionType(code, {"__name__": __name__, "__builtins__": {}, **functions})
-
-
-def _compiled(what: str, body: list[ast.stmt], arguments: Arguments, in_place: bool) -> CodeType:
-    given = {"t": True, "y": True, "dy": arguments.arrays["dy"], "out": in_place, "params": arguments.arrays["params"]}
-    names = ", ".join(name for name, there in given.items() if there)
-    module = ast.parse(f"def written({names}): pass")
-    (definition,) = module.body
-    assert isinstance(definition, ast.FunctionDef)
-    definition.body = body
-    ast.fix_missing_locations(module)
-    (code,) = (item for item in compile(module, f"<{what}>", "exec").co_consts if isinstance(item, CodeType))
-    return code
-
-
-def _statements(
-    what: str, expressions: Sequence[Any], arguments: Arguments, in_place: bool, places: Sequence[Any] | None = None
-) -> list[ast.stmt]:
-    writer = Writer(what, arguments)
-    values = writer.values(expressions)
-    body = [*_checks(arguments), *writer.body]
-    if places is not None:
-        body += _written("out[:] = 0.0")
-    if in_place:
-        for k, value in zip(range(len(values)) if places is None else places, values, strict=True):
-            body += _written(f"out[{k}] = value", value=value)
-        return body
-    (value,) = values
-    return [*body, ast.Return(value=value)]
-
-
-def _products(n: int, entries: Mapping[tuple[int, int], ast.expr]) -> list[ast.stmt]:
-    """Return statements that set the column of `out` from index k on to the Jacobian times the same column of `y`.
-
-    `entries` holds the nonzero entries of the Jacobian (n, n), by row and column.
-    """
-    # The column of y is read first, because compiled code would read it again after each number that it writes.
-    body = [item for j in sorted({j for _, j in entries}) for item in _written(f"d{j} = y[k + {j}]")]
-    for i in range(n):
-        terms: list[ast.expr] = [
-            ast.BinOp(left=value, op=ast.Mult(), right=_load(f"d{j}"))
-            for (row, j), value in entries.items()
-            if row == i
-        ]
-        total = reduce(lambda a, b: ast.BinOp(left=a, op=ast.Add(), right=b), terms or [ast.Constant(value=0.0)])
-        body += _written(f"out[k + {i}] = total", total=total)
-    return body
-
-
-def _checks(arguments: Arguments) -> Iterable[ast.stmt]:
-    """Yield statements that check the sizes of arrays, because compiled code does not check indices."""
-    for array, names in arguments.arrays.items():
-        if names:
-            text = f"{array} must hold as many numbers as there are names in ({', '.join(names)}): {len(names)}"
-            template = f"if {array}.size != {len(names)}: raise ValueError(text)"
-            yield from _written(template, text=ast.Constant(value=text))
-
-
-def _written(template: str, **nodes: ast.expr) -> list[ast.stmt]:
-    """Return the statements of `template`, which has no names of users, with `nodes` in place of its names."""
-    return _Filled(nodes).visit(ast.parse(template)).body
-
-
-class _Filled(ast.NodeTransformer):
-    def __init__(self, nodes: Mapping[str, ast.expr]) -> None:
-        self.nodes = nodes
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        return self.nodes.get(node.id, node)
-
-
-def _load(name: str) -> ast.expr:
-    return ast.Name(id=name, ctx=ast.Load())
-
-
-class Writer:
-    """Writer of statements that compute expressions, appended to `body`; the same operation is written once."""
+class _Writer:
+    """Writer of functions that compute expressions; `constants` holds the names of constants by value."""
 
     def __init__(self, what: str, arguments: Arguments) -> None:
-        self.what = what
-        self.body: list[ast.stmt] = []
-        self.known: dict[Any, ast.expr] = {}
+        self.what, self.arguments, self.checks = what, arguments, _checks(arguments)
+        self.constants: dict[Any, str] = {}
+        self._body: list[str] = []
+        self._places = {
+            name: f"{array}[{k}]" for array, names in arguments._asdict().items() for k, name in enumerate(names)
+        }
+        self._known: dict[Any, str] = {symbol("t"): "t"}  # names of values
+        self._variables: dict[str, str] = {}  # by operation
         self._common: dict[Any, Any] = {}  # symbols of `cse` and their expressions
-        self._written: dict[str, ast.expr] = {}
-        self._places = arguments.places
 
-    def values(self, expressions: Sequence[Any]) -> list[ast.expr]:
-        """Write statements that compute expressions; return the variables or constants that hold their values."""
+    def code(self, lines: Sequence[str], in_place: bool) -> CodeType:
+        """Return the code of a function: checks, the statements that were written, and `lines`."""
+        given = {"dy": self.arguments.dy, "out": in_place, "params": self.arguments.params}
+        names = ", ".join(["t", "y", *(name for name, there in given.items() if there)])
+        source = "\n    ".join([f"def written({names}):", *self.checks, *self._body, *lines])
+        return next(x for x in compile(source, f"<{self.what}>", "exec").co_consts if isinstance(x, CodeType))
+
+    def function(self, lines: Sequence[str], in_place: bool = True) -> Callable[..., Any]:
+        """Return the function that ends with the statements `lines`, jitted if Numba is installed."""
+        code, numbers = self.code(lines, in_place), {name: float(item) for item, name in self.constants.items()}
+        numbers |= {"__name__": __name__, "__builtins__": {}}  # type: ignore[dict-item]
+        fast = jitted(compilable(FunctionType(code, COMPILED | numbers)))
+        return fast if is_jitted(fast) else FunctionType(code, INTERPRETED | numbers)
+
+    def values(self, expressions: Sequence[Any]) -> list[str]:
+        """Write statements that compute expressions; return the names of their values."""
         written = [with_powers_of_roots(item) for item in expressions]
         common, reduced = sympy.cse(written, symbols=sympy.numbered_symbols(cls=sympy.Dummy), list=True)
         for name, expression in common:
             self._common[name] = expression
-            self.known[name] = self.value(expression)
-        return [self.value(expression) for expression in reduced]
+            self._known[name] = self._value(expression)
+        return [self._value(expression) for expression in reduced]
 
-    def value(self, expression: Any) -> ast.expr:
-        """Return the variable or constant that holds the value of an expression; write its statements if it is new."""
-        if expression not in self.known:
-            self.known[expression] = self._write(expression)
-        return self.known[expression]
+    def _value(self, item: Any) -> str:
+        """Return the name of the value of an expression; write its statements if it is new."""
+        if item not in self._known:
+            self._known[item] = self._written(item)
+        return self._known[item]
 
-    def _write(self, expression: Any) -> ast.expr:
-        match expression:
+    def _assign(self, operation: str) -> str:
+        """Return the name of the variable for an operation; write the operation if it is new."""
+        if operation not in self._variables:
+            self._variables[operation] = name = f"v{len(self._variables)}"
+            self._body.append(f"{name} = {operation}")
+        return self._variables[operation]
+
+    def _chain(self, operation: str, values: Iterable[str]) -> str:
+        return reduce(lambda a, b: self._assign(operation.format(a, b)), values)
+
+    def _written(self, item: Any) -> str:
+        if operation := OPERATIONS.get(type(item)):
+            return self._assign(operation.format(*map(self._value, item.args)))
+        if operation := CHAINS.get(type(item)):
+            return self._chain(operation, map(self._value, item.args))
+        match item:
             case sympy.Symbol():
-                return self._variable(expression.name)
-            case sympy.Rational():
-                return ast.Constant(value=int(expression.p) / int(expression.q))
-            case sympy.Float() | sympy.NumberSymbol():
-                return ast.Constant(value=float(expression))
+                return self._assign(self._places[item.name])
+            case sympy.Rational() | sympy.Float() | sympy.NumberSymbol():
+                return self.constants.setdefault(item, f"c{len(self.constants)}")
             case sympy.Add():
-                return self._sum(expression.args)
+                return self._sum(item.args)
             case sympy.Mul():
-                return self._product(expression)
+                return self._product(item)
             case sympy.Pow():
-                return self._power(*expression.args)
+                return self._power(*item.args)
             case sympy.Piecewise():
-                return self._cases(expression)
-            case sympy.Function() | sympy.Max() | sympy.Min():
-                return self._call(expression)
-        raise self._unknown(expression)
-
-    def _unknown(self, expression: Any) -> ValueError:
+                return self._cases(item)
         for name, meaning in reversed(self._common.items()):
-            expression = expression.xreplace({name: meaning})
-        if isinstance(expression, sympy.DiracDelta):
-            return ValueError(
-                f"{self.what}: it is the derivative of a function that jumps where {expression.args[0]} is 0. Use a "
+            item = item.xreplace({name: meaning})
+        if isinstance(item, sympy.DiracDelta):
+            raise ValueError(
+                f"{self.what}: it is the derivative of a function that jumps where {item.args[0]} is 0. Use a "
                 "continuous function, such as abs, max or min, or write the equations with `equations`."
             )
-        allowed = ", ".join(sorted(item.__name__ for item in (*CALLS, *OTHERS)))
-        kind = type(expression).__name__
-        return ValueError(f"{self.what}: {kind} in {expression} is not supported. Supported are {allowed}.")
+        raise ValueError(f"{self.what}: {type(item).__name__} in {item} is not supported. Supported are {SUPPORTED}.")
 
-    def _name(self, operation: ast.expr) -> ast.expr:
-        """Return the variable for an operation on names and constants; write the operation if it is new."""
-        text = ast.dump(operation)
-        if text not in self._written:
-            name = f"v{len(self._written)}"
-            self.body.append(ast.Assign(targets=[ast.Name(id=name, ctx=ast.Store())], value=operation))
-            self._written[text] = _load(name)
-        return self._written[text]
-
-    def _variable(self, name: str) -> ast.expr:
-        array, place = self._places[name]
-        return _load(array) if place is None else self._expression(f"{array}[{place}]")
-
-    def _expression(self, template: str, **nodes: ast.expr) -> ast.expr:
-        return self._name(_written(template, **nodes)[0].value)  # type: ignore[attr-defined]
-
-    def _binary(self, left: ast.expr, operator: ast.operator, right: ast.expr) -> ast.expr:
-        return self._name(ast.BinOp(left=left, op=operator, right=right))
-
-    def _sum(self, terms: Sequence[Any]) -> ast.expr:
+    def _sum(self, terms: Sequence[Any]) -> str:
         # Negative terms come last, because a sum that starts with one would need a negation.
-        signed = sorted(((term.could_extract_minus_sign(), term) for term in terms), key=lambda item: item[0])
-        (negative, first), *others = signed
-        total = self.value(first)
-        for negative, term in others:
-            total = self._binary(total, ast.Sub() if negative else ast.Add(), self.value(-term if negative else term))
+        first, *others = sorted(terms, key=lambda term: term.could_extract_minus_sign())
+        total = self._value(first)
+        for term in others:
+            negative = term.could_extract_minus_sign()
+            total = self._assign(f"{total} {'-' if negative else '+'} {self._value(-term if negative else term)}")
         return total
 
-    def _product(self, expression: Any) -> ast.expr:
-        factor, rest = expression.as_coeff_Mul()
+    def _product(self, item: Any) -> str:
+        factor, rest = item.as_coeff_Mul()
         if factor < 0:
-            return self._name(ast.UnaryOp(op=ast.USub(), operand=self.value(-expression)))
+            return self._assign(f"-{self._value(-item)}")
         over, under = [], []
-        for item in sympy.Mul.make_args(rest):
-            base, exponent = item.as_base_exp()
+        for part in sympy.Mul.make_args(rest):
+            base, exponent = part.as_base_exp()
             if exponent.is_Rational and exponent < 0:
-                under.append(self.value(base**-exponent))
+                under.append(self._value(base**-exponent))
             else:
-                over.append(self.value(item))
+                over.append(self._value(part))
         if factor != 1:
-            over.append(self.value(factor))
-        top = self._all(over) if over else ast.Constant(value=1.0)
-        return self._binary(top, ast.Div(), self._all(under)) if under else top
+            over.append(self._value(factor))
+        top = self._chain("{} * {}", over) if over else "1.0"
+        return self._assign(f"{top} / {self._chain('{} * {}', under)}") if under else top
 
-    def _all(self, factors: Sequence[ast.expr]) -> ast.expr:
-        return reduce(lambda a, b: self._binary(a, ast.Mult(), b), factors)
-
-    def _power(self, base: Any, exponent: Any) -> ast.expr:
+    def _power(self, base: Any, exponent: Any) -> str:
         whole = 2 * exponent if exponent.is_Rational else exponent
         if not (whole.is_Integer and abs(whole) <= LARGEST_PRODUCT):
-            return self._binary(self.value(base), ast.Pow(), self.value(exponent))
+            return self._assign(f"{self._value(base)} ** {self._value(exponent)}")
         if whole < 0:
-            return self._binary(ast.Constant(value=1.0), ast.Div(), self.value(base**-exponent))
-        value = self.value(base)
-        count, half = divmod(int(whole), 2)
-        root = [self._function("sqrt", value)] if half else []
-        return self._all([*([self._repeated(value, count)] if count else []), *root])
+            return self._assign(f"1.0 / {self._value(base**-exponent)}")
+        value, (count, half) = self._value(base), divmod(int(whole), 2)
+        factors = ([self._repeated(value, count)] if count else []) + ([self._assign(f"sqrt({value})")] if half else [])
+        return self._chain("{} * {}", factors)
 
-    def _repeated(self, value: ast.expr, count: int) -> ast.expr:
+    def _repeated(self, value: str, count: int) -> str:
+        """Return the name of a power of a value, by squares."""
         if count == 1:
             return value
         half = self._repeated(value, count // 2)
-        square = self._binary(half, ast.Mult(), half)
-        return self._binary(square, ast.Mult(), value) if count % 2 else square
+        square = self._assign(f"{half} * {half}")
+        return self._assign(f"{square} * {value}") if count % 2 else square
 
-    def _function(self, name: str, *arguments: ast.expr) -> ast.expr:
-        return self._name(ast.Call(func=_load(name), args=list(arguments), keywords=[]))
-
-    def _call(self, expression: Any) -> ast.expr:
-        kind, arguments = type(expression), [self.value(item) for item in expression.args]
-        if kind in CALLS:
-            return self._function(CALLS[kind], *arguments)
-        if kind in RECIPROCALS:
-            return self._expression("1.0 / value", value=self._function(RECIPROCALS[kind], *arguments))
-        match expression:
-            case sympy.Abs() | sympy.erf():
-                return self._function(kind.__name__.lower(), *arguments)
-            case cbrt():
-                root = self._expression(f"value ** {1 / 3!r}", value=self._function("abs", *arguments))
-                return self._function("copysign", root, *arguments)
-            case sympy.Max() | sympy.Min():
-                name = kind.__name__.lower()
-                return reduce(lambda a, b: self._function(name, a, b), arguments)
-            case sympy.sign():
-                return self._expression(BY_SIGN.format(-1.0, 0.0), value=arguments[0])
-            case sympy.Heaviside():
-                return self._expression(BY_SIGN.format(0.0, 0.5), value=arguments[0])
-        raise self._unknown(expression)
-
-    def _cases(self, expression: Any) -> ast.expr:
+    def _cases(self, item: Any) -> str:
         """Return the first value of a Piecewise whose condition holds, NaN if none holds; all values are computed."""
-        chosen: ast.expr = ast.Constant(value=math.nan)
-        for value, condition in reversed(expression.args):
-            found = self.value(value)
-            if condition == sympy.true:
-                chosen = found
-            else:
-                chosen = self._name(ast.IfExp(test=self._condition(condition), body=found, orelse=chosen))
+        chosen = "nan"
+        for value, condition in reversed(item.args):
+            found = self._value(value)
+            is_last = condition == sympy.true
+            chosen = found if is_last else self._assign(f"{found} if {self._value(condition)} else {chosen}")
         return chosen
-
-    def _condition(self, condition: Any) -> ast.expr:
-        kind = type(condition)
-        if kind in COMPARISONS:
-            left, right = (self.value(item) for item in condition.args)
-            return ast.Compare(left=left, ops=[COMPARISONS[kind]()], comparators=[right])
-        match condition:
-            case sympy.And() | sympy.Or():
-                parts = [self._condition(item) for item in condition.args]
-                return ast.BoolOp(op=ast.And() if isinstance(condition, sympy.And) else ast.Or(), values=parts)
-            case sympy.Not():
-                return ast.UnaryOp(op=ast.Not(), operand=self._condition(condition.args[0]))
-        raise self._unknown(condition)
