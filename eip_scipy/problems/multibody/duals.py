@@ -10,11 +10,28 @@ import numpy as np
 
 from ...core.dual_arrays import inside
 from ...core.dual_numbers import put_slope, seed, slope, value_of
+from ...core.functions import compilable, jitted
+from .differentiated import difference
 from .motion import changed, solve
 
-__all__ = ["by_differences", "solve_duals"]
+__all__ = ["fill_duals", "solve_duals"]
 
-_solve, _changed = inside(solve), inside(changed)
+_solve, _changed, _difference = inside(solve), inside(changed), jitted(compilable(difference))
+
+
+def _parts_of(numbers, lane, values, slopes):
+    """Fill `values` and `slopes` with the values of dual numbers and their derivatives in one lane."""
+    for k in range(numbers.size):
+        values[k], slopes[k] = value_of(numbers[k]), slope(numbers[k], lane)
+
+
+def _put(dual, values, slopes, lane, out):
+    """Write values to the dual numbers `out` if `lane` is 0, and derivatives in this lane."""
+    for k in range(out.size):
+        out[k] = put_slope(seed(dual, values[k], -1) if lane == 0 else out[k], lane, slopes[k])
+
+
+_parts_of, _put = inside(_parts_of), inside(_put)
 
 
 @cache
@@ -27,51 +44,31 @@ def solve_duals(dual: Any) -> Callable[..., int]:
 
     def solved(matrices, n, m, tolerance, accelerations, multipliers):
         values, changes = np.empty(matrices.size), np.empty(matrices.size)
-        for k in range(matrices.size):
-            values[k] = value_of(matrices[k])
-        solution, found = (np.empty(n), np.empty(m)), (np.empty(n), np.empty(m))
-        rank = _solve(values, n, m, tolerance, solution[0], solution[1])
-        for i in range(n):
-            accelerations[i] = seed(dual, solution[0][i], -1)
-        for k in range(m):
-            multipliers[k] = seed(dual, solution[1][k], -1)
+        solution, found, rank = (np.empty(n), np.empty(m)), (np.empty(n), np.empty(m)), 0
         for lane in range(lanes):
-            for k in range(matrices.size):
-                changes[k] = slope(matrices[k], lane)
+            _parts_of(matrices, lane, values, changes)
+            if lane == 0:
+                rank = _solve(values, n, m, tolerance, solution[0], solution[1])
             _changed(values, changes, n, m, tolerance, solution, found)
-            for i in range(n):
-                accelerations[i] = put_slope(accelerations[i], lane, found[0][i])
-            for k in range(m):
-                multipliers[k] = put_slope(multipliers[k], lane, found[1][k])
+            _put(dual, solution[0], found[0], lane, accelerations)
+            _put(dual, solution[1], found[1], lane, multipliers)
         return rank
 
     return inside(solved)
 
 
 @cache
-def by_differences(fill: Any, difference: Any, dual: Any) -> Callable[..., None]:
-    """Return ``fill(t, y, out)`` for arrays of numbers of the type `dual`.
-
-    ``difference(t, y, y, dt, dy, unit, out)`` fills `out` with the derivative of `fill` along a direction.
-    """
+def fill_duals(fill: Any, dual: Any) -> Callable[..., None]:
+    """Return ``fill(t, y, out)`` for arrays of numbers of the type `dual`; its derivatives are differences."""
     lanes = dual.lanes
 
     def filled(t, y, out):
-        values, way, found = np.empty(y.size), np.empty(y.size), np.empty(out.size)
-        for i in range(y.size):
-            values[i] = value_of(y[i])
-        fill(t, values, found)
-        for i in range(out.size):
-            out[i] = seed(dual, found[i], -1)
+        values, way, found, changes = np.empty(y.size), np.empty(y.size), np.empty(out.size), np.empty(out.size)
         for lane in range(lanes):
-            size, moving = 0.0, 0.0
-            for i in range(y.size):
-                way[i] = slope(y[i], lane)
-                size, moving = max(size, abs(values[i])), max(moving, abs(way[i]))
-            if moving == 0.0:
-                continue
-            difference(t, values, values, 0.0, way, (size if size > 0.0 else 1.0) / moving, found)
-            for i in range(out.size):
-                out[i] = put_slope(out[i], lane, found[i])
+            _parts_of(y, lane, values, way)
+            if lane == 0:
+                fill(t, values, found)
+            _difference(fill, t, values, 0.0, way, np.inf, changes)
+            _put(dual, found, changes, lane, out)
 
     return inside(filled)

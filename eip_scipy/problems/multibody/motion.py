@@ -98,16 +98,6 @@ def _solve_any(matrices, n, m, tolerance, accelerations, multipliers):
     return rank
 
 
-def new_floats(size, like):
-    """Return a new array of floats, so that no function is compiled for complex states, which C code would misread."""
-    return np.empty(size)
-
-
-def new_like(size, like):
-    """Return a new array with the dtype of the array `like`: for complex steps, that of complex numbers."""
-    return np.empty(size, like.dtype)
-
-
 def _solve_duals(dual: Any) -> Callable[..., int]:
     """Return `solve` for arrays of numbers of the type `dual`, for compiled code."""
     from .duals import solve_duals  # which loads Numba
@@ -116,6 +106,16 @@ def _solve_duals(dual: Any) -> Callable[..., int]:
 
 
 solve.for_duals = _solve_duals  # type: ignore[attr-defined]
+
+
+def new_floats(size, like):
+    """Return a new array of floats, so that no function is compiled for complex states, which C code would misread."""
+    return np.empty(size)
+
+
+def new_like(size, like):
+    """Return a new array with the dtype of the array `like`: for complex steps, that of complex numbers."""
+    return np.empty(size, like.dtype)
 
 
 @lru_cache(maxsize=64)
@@ -150,6 +150,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
         for k in range(n):
             out[nq + k] = accelerations[k]
 
+    rhs.not_jitted = getattr(fill, "not_jitted", "")  # type: ignore[attr-defined]
     return Motion(compiled_like(rhs, fast), fast)
 
 
