@@ -76,19 +76,17 @@ def mechanism(
     t_span : tuple of float, optional
         Start and end of the interval. If it is omitted, the start is at t = 0.
     velocity_constraints : callable, optional
-        ``velocity_constraints(t, q, u)``, (k,), linear in u, the expressions that further constraints set to 0. These
-        are constraints that are not derivatives of `constraints`, such as those of rolling wheels.
+        ``velocity_constraints(t, q, u)``, (k,), linear in u, the expressions that further constraints set to 0, which
+        are not derivatives of `constraints`, such as those of rolling wheels.
     kinematics : callable, optional
         ``kinematics(t, q, u)``, the derivatives q', linear in u. Default: q' = u.
     jacobian, gamma : callable, optional
         ``jacobian(t, q)``, the derivatives (m, n) of `constraints` with respect to q, and ``gamma(t, q, u)``, (m + k,),
-        the second time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. By default
-        both are computed. If they are given, they are compared with computed derivatives at the start.
-    energy : callable, optional
-        ``energy(t, q, u)``, the total energy.
-    potential_energy : callable, optional
-        ``potential_energy(t, q)``, for the energy u M u / 2 + potential_energy. If neither this nor `energy` is given,
-        the energy is not known.
+        the second time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. Default:
+        computed. Given ones are compared with differences near the start.
+    energy, potential_energy : callable, optional
+        ``energy(t, q, u)``, the total energy, or ``potential_energy(t, q)`` for u M u / 2 + potential_energy. Without
+        one of them the energy is not known.
     power : callable, optional
         ``power(t, q, u)``, the rate of change of the energy, which then becomes a `Balance`. Default: it is computed.
     outputs : mapping, optional
@@ -113,19 +111,16 @@ def mechanism(
     ------
     ValueError
         If shapes do not fit, a function that must be linear in u is not, the start does not meet the constraints, the
-        mass matrix is not symmetric, it is not positive for motions that the constraints allow, or a given derivative
-        or power is wrong.
+        mass matrix is not symmetric or not positive, or a given derivative or power is wrong.
 
     Notes
     -----
     If all functions are jitted by Numba (except those of `outputs`), the whole problem is compiled, and first
-    derivatives come from dual numbers. Plain Python functions are called from Python, which takes much longer; first
-    derivatives then come from complex steps, or from differences if a function is not analytic. In both cases second
-    derivatives, such as `gamma`, are differences of the first ones. Next to a singular position, at which gradients of
-    constraints are dependent, their rounding is magnified: pass `gamma` if a run passes through such positions.
-
-    As in all compiled code, a number or an array that a jitted function takes from outside has the value that it had
-    when the function was compiled.
+    derivatives come from dual numbers; arrays and numbers from outside have the values of the time of compilation.
+    Plain Python functions are called from Python, which takes much longer; first derivatives then come from complex
+    steps, or from differences. Second derivatives, such as `gamma`, are differences of the first ones. Next to a
+    singular position, at which gradients of constraints are dependent, their rounding is magnified: pass `gamma` if a
+    run passes through such positions.
 
     Examples
     --------
@@ -146,20 +141,25 @@ def mechanism(
     }  # fmt: skip
     given = {what: _checked(what, item) for what, item in given.items() if item is not None}
     t, interval = (0.0, np.inf) if t_span is None else (float(t_span[0]), abs(float(t_span[1]) - float(t_span[0])))
-    q, u = _given_state("q0", q0, coordinates), _given_state("u0", u0, speeds)
+    (of_q, q), (of_u, u) = _named("q0", q0, coordinates, "q"), _named("u0", u0, speeds, "u")
     of, y = {what: of_state(item, TAKES[what], q.size) for what, item in given.items()}, np.append(q, u)
     m, k = (np.size(of[what](t, y)) if what in of else 0 for what in ("constraints", "velocity_constraints"))
-    sizes = q.size, u.size, m, k
-    _require_shapes(of, t, y, sizes)
-    _require_symmetric(np.asarray(of["mass"](t, y), float))
+    _require_shapes(of, t, y, (q.size, u.size, m, k))
     _require_linear(of, t, q, u.size)
-    names, longest = _names(coordinates, speeds, constraint_names, sizes), _longest(of, t, q, u, interval)
+    g = _numbered(constraint_names, "g", m + k)
+    names = Names(of_q, of_u, g[:m], (*(f"{item}'" for item in g[:m]), *g[m:]))
+    if "t" in names.state:
+        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
+    # Constraints may depend on time. Differences over more time than this would be wrong while little moves.
+    if not 0 < (longest := interval) < np.inf:
+        moving = time_of_motion(q, np.asarray(of["kinematics"](t, y), float) if "kinematics" in of else u)
+        longest = max(1.0, moving) if moving < np.inf else 1.0
     parts = parts_of_functions(given, _checked_outputs(outputs, names, t, y), names, (t, y), longest)
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
     _require_derivatives(of, parts, problem, t, longest)
-    _require_positive(parts, names, t, problem.y0, rank_tolerance)
+    _require_masses(parts, names, t, problem.y0, rank_tolerance)
     return problem
 
 
@@ -171,15 +171,6 @@ def _checked(what: str, item: Any) -> Any:
         raise TypeError(f"mechanism: {what} must be a function, got {shown(item)}.")
     values = np.atleast_1d(real_array(what, item))
     return np.diag(values) if what == "mass" and values.ndim == 1 else values
-
-
-def _longest(of: Mapping[str, Any], t: float, q: np.ndarray, u: np.ndarray, interval: float) -> float:
-    """Return the longest time for differences: constraints may depend on time while the mechanism moves little."""
-    if 0 < interval < np.inf:
-        return interval
-    rates = np.asarray(of["kinematics"](t, np.append(q, u)), float) if "kinematics" in of else u
-    duration = time_of_motion(q, rates)
-    return max(1.0, duration if np.isfinite(duration) else 1.0)
 
 
 def _checked_outputs(outputs: Any, names: Names, t: float, y: np.ndarray) -> dict[str, Callable[..., Any]]:
@@ -196,25 +187,19 @@ def _checked_outputs(outputs: Any, names: Names, t: float, y: np.ndarray) -> dic
     return found
 
 
-def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
+def _named(what: str, given: Any, names: Any, letter: str) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the names of the components in `given`, and values for first calls of functions, by default 0."""
     if isinstance(given, Mapping):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
-        return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])
-    return np.atleast_1d(real_array(what, given)).astype(float)
+        names = component_names(names, None)
+        return names, np.array([float(given.get(name, 0.0)) for name in names])
+    values = np.atleast_1d(real_array(what, given)).astype(float)
+    return _numbered(names, letter, values.size), values
 
 
-def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence[int]) -> Names:
-    nq, n, m, k = sizes
-    given = (coordinates, "q", nq), (speeds, "u", n), (constraint_names, "g", m + k)
-    q, u, g = (
-        component_names([f"{letter}{j + 1}" for j in range(count)] if own is None else own, count)
-        for own, letter, count in given
-    )
-    if "t" in (*q, *u):
-        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
-    return Names(q, u, g[:m], (*(f"{item}'" for item in g[:m]), *g[m:]))
+def _numbered(names: Any, letter: str, count: int) -> tuple[str, ...]:
+    return component_names([f"{letter}{j + 1}" for j in range(count)] if names is None else names, count)
 
 
 def _require_shapes(of: Mapping[str, Any], t: float, y: np.ndarray, sizes: Sequence[int]) -> None:
@@ -237,8 +222,12 @@ def _require_shapes(of: Mapping[str, Any], t: float, y: np.ndarray, sizes: Seque
             )
 
 
-def _require_symmetric(M: np.ndarray) -> None:
-    """Raise ValueError if the mass matrix M is not symmetric."""
+def _require_masses(parts: Parts, names: Names, t: float, y: np.ndarray, tolerance: float) -> None:
+    """Raise ValueError if the mass matrix M is not symmetric, or u M u / 2 < 0 for speeds that the constraints allow.
+
+    Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
+    """
+    M, _, G, _, _ = parts.matrices(names, t, y)
     wrong = np.abs(M - M.T)
     if (wrong > ROUNDING * np.abs(M).max(initial=0.0)).any():
         i, j = np.unravel_index(np.argmax(wrong), M.shape)
@@ -246,14 +235,6 @@ def _require_symmetric(M: np.ndarray) -> None:
             f"mechanism: mass must be a symmetric matrix, but at the start its entries [{i}, {j}] and [{j}, {i}] are "
             f"{M[i, j]:.6g} and {M[j, i]:.6g}. Correct one of them, or give only the diagonal of a diagonal matrix."
         )
-
-
-def _require_positive(parts: Parts, names: Names, t: float, y: np.ndarray, tolerance: float) -> None:
-    """Raise ValueError if the kinetic energy u M u / 2 is negative at the start for speeds that the constraints allow.
-
-    Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
-    """
-    M, _, G, _, _ = parts.matrices(names, t, y)
     sizes = np.linalg.norm(G, axis=1, keepdims=True)
     _, found, directions = np.linalg.svd(G / np.where(sizes > 0, sizes, 1.0))
     allowed = directions[np.count_nonzero(found > tolerance) :].T

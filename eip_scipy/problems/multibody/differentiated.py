@@ -16,10 +16,11 @@ import numpy as np
 from ...core import gradients as steps
 from ...core.functions import NotCompilableError, compilable, is_jitted, jit_is_off, jitted, own_values
 from ...engine.data import EPS
+from .motion import complex_parts, put_complex
 from .parts import Energy, Outputs, Parts
 from .start import Names
 
-__all__ = ["TAKES", "difference", "of_state", "parts_of_functions"]
+__all__ = ["TAKES", "difference", "fill_changed", "of_state", "parts_of_functions"]
 
 Array = np.ndarray
 # The arguments of the functions of a mechanism: some of t, q and u.
@@ -27,9 +28,7 @@ TAKES = {
     "mass": "q", "forces": "tqu", "constraints": "tq", "velocity_constraints": "tqu", "kinematics": "tqu",
     "jacobian": "tq", "gamma": "tqu", "energy": "tqu", "potential_energy": "tq", "power": "tqu",
 }  # fmt: skip
-WEIGHTS = tuple(weight for _, weight in steps.DIFFERENCE_WEIGHTS)
-DIFFER, FIRST_SHIFT, LEAST, LOWER_WEIGHTS = steps.DIFFER, steps.FIRST_SHIFT, steps.LEAST, steps.LOWER_WEIGHTS
-MOST_SHIFTS, SHORTER, ROUNDING, BETTER = steps.MOST_SHIFTS, steps.SHORTER, steps.ROUNDINGS * EPS, 10.0
+WEIGHTS, ROUNDING, BETTER = tuple(weight for _, weight in steps.DIFFERENCE_WEIGHTS), steps.ROUNDINGS * EPS, 10.0
 
 
 def of_state(item: Any, takes: str, nq: int) -> Callable[[float, Array], Any]:
@@ -66,9 +65,9 @@ def difference(function, t, y, dt, dy, longest, out):
         if dy[k] != 0.0:
             moved = max(moved, abs(y[k]))
     way = (moved if moved > 0.0 else size if size > 0.0 else 1.0) / moving if moving > 0.0 else 1.0
-    shift = 2.0 ** np.floor(np.log2(FIRST_SHIFT * min(way, longest)) + 0.5)
+    shift = 2.0 ** np.floor(np.log2(steps.FIRST_SHIFT * min(way, longest)) + 0.5)
     x, ends, sums, lower = y.copy(), np.empty((2, out.size)), out.copy(), out.copy()
-    for attempt in range(MOST_SHIFTS):
+    for attempt in range(steps.MOST_SHIFTS):
         largest, excess = 0.0, 0.0
         for i in range(out.size):
             sums[i] = lower[i] = 0.0
@@ -80,10 +79,10 @@ def difference(function, t, y, dt, dy, longest, out):
                 function(t + s * dt, x, ends[side])
             for i in range(out.size):
                 sums[i] += WEIGHTS[j] * (ends[0, i] - ends[1, i])
-                lower[i] += LOWER_WEIGHTS[j] * (ends[0, i] - ends[1, i])
+                lower[i] += steps.LOWER_WEIGHTS[j] * (ends[0, i] - ends[1, i])
                 largest = max(largest, abs(ends[0, i]), abs(ends[1, i]))
         for i in range(out.size):
-            share = abs(sums[i] - lower[i]) / (DIFFER * abs(sums[i]) + ROUNDING * largest + LEAST)
+            share = abs(sums[i] - lower[i]) / (steps.DIFFER * abs(sums[i]) + ROUNDING * largest + steps.LEAST)
             excess = share if share > excess else excess if share <= excess else np.inf
         # Shorter shifts have larger rounding errors: one is used only if the orders agree much better.
         if attempt == 0 or BETTER * excess < least:
@@ -92,7 +91,22 @@ def difference(function, t, y, dt, dy, longest, out):
                 out[i] = sums[i] / shift
         if least <= 1.0:
             break
-        shift *= SHORTER
+        shift *= steps.SHORTER
+
+
+def fill_changed(fill, difference, lanes, parts_of, put):
+    """Return ``fill(t, y, out)`` for numbers with derivatives in several directions; see `solve_changed`."""
+
+    def filled(t, y, out):
+        values, way, found, changes = np.empty(y.size), np.empty(y.size), np.empty(out.size), np.empty(out.size)
+        for lane in range(lanes):
+            parts_of(y, lane, values, way)
+            if lane == 0:
+                fill(t, values, found)
+            difference(fill, t, values, 0.0, way, np.inf, changes)
+            put(found, changes, lane, out)
+
+    return filled
 
 
 def parts_of_functions(
@@ -284,17 +298,9 @@ class _Maker:
                 gamma_of(t, y, out[gamma:rates])
             put(kinematics(t, y), out[rates:])
 
-        def fill_any(t, y, out):
-            if y.dtype.kind == "f":
-                return fill(t, y, out)
-            # Imaginary parts are derivatives (complex steps).
-            values, changes = np.empty(out.size), np.empty(out.size)
-            fill(t, y.real.copy(), values)
-            difference(fill, t, y.real.copy(), 0.0, y.imag, np.inf, changes)
-            out[:] = values + 1j * changes
-
         if not self.compiles:
-            return fill_any
+            of_complex = fill_changed(fill, difference, 1, complex_parts, put_complex)
+            return lambda t, y, out: (fill if y.dtype.kind == "f" else of_complex)(t, y, out)
         from .duals import fill_duals  # which loads Numba
 
         found = self.made(fill)

@@ -64,8 +64,8 @@ class Parts(NamedTuple):
 
     def matrices(self, names: Names, t: float, y: np.ndarray, args: tuple[Any, ...] = ()) -> list[np.ndarray]:
         """Return M, F, G, gamma and q' at a state, computed by functions that are not compiled."""
-        n, m = len(names.speeds), len(names.velocities)
-        out = np.empty(names.sizes.matrices + len(names.coordinates))
+        nq, n, m = names.sizes
+        out = np.empty((n + m + 1) * n + m + nq)
         plain(self.fill)(t, y, out, *args)
         M, F, G, gamma, rates = np.split(out, np.cumsum([n * n, n, m * n, m]))
         return [M.reshape(n, n), F, G.reshape(m, n), gamma, rates]

@@ -91,14 +91,15 @@ class MechanicsProblem(Problem):
         y : array_like, shape (n,) or (n, k)
             States, such as ``run.y``.
         params : mapping or array_like, optional
-            Parameters of the run. Default: those of the problem.
+            Parameters of the run, or (k, p) of each state. Default: those of the problem.
 
         Returns
         -------
         Multipliers
         """
-        solved = [self._solved(*state, params) for state in self._states("multipliers", t, y)]
-        ranks, values = np.array([item[0] for item in solved]), np.array([item[2] for item in solved]).T.copy()
+        solved = [self._solved(*state) for state in self._states("multipliers", t, y, params)]
+        ranks = np.array([item[0] for item in solved], int)
+        values = np.array([item[2] for item in solved]).reshape(-1, len(self.names.velocities)).T.copy()
         if np.ndim(t) == 0:
             return Multipliers(self.names.velocities, values[:, 0], int(ranks[0]))
         return Multipliers(self.names.velocities, values, ranks)
@@ -119,11 +120,10 @@ class MechanicsProblem(Problem):
         """
         if self.parts.outputs is None:
             return {}
-        states, (names, fill) = self._states("outputs", t, y), self.parts.outputs
+        states, (names, fill) = self._states("outputs", t, y, params), self.parts.outputs
         found = np.empty((len(states), len(names)))
-        for row, (time, state) in zip(found, states, strict=True):
-            accelerations = self._solved(time, state, params)[1]
-            plain(fill)(time, np.append(state, accelerations), row, *self._extra(params))
+        for row, (time, state, *args) in zip(found, states, strict=True):
+            plain(fill)(time, np.append(state, self._solved(time, state, *args)[1]), row, *args)
         return dict(zip(names, found[0].tolist() if np.ndim(t) == 0 else found.T.copy(), strict=True))
 
     def observed(self, t: Any, y: Any, params: Any = None) -> dict[str, Any]:
@@ -131,22 +131,18 @@ class MechanicsProblem(Problem):
         found: dict[str, Any] = {} if self.parts.outputs is None else {"outputs": self.outputs(t, y, params)}
         return found | ({"multipliers": self.multipliers(t, y, params)} if self.names.velocities else {})
 
-    def _states(self, what: str, t: Any, y: Any) -> list[tuple[float, np.ndarray]]:
-        """Return times, and states for each of them; ValueError if they do not fit."""
+    def _states(self, what: str, t: Any, y: Any, params: Any) -> list[tuple[Any, ...]]:
+        """Return a time, a state and, if there are parameters, an array of them for each t; ValueError if y misfits."""
         n, times, states = len(self.names.state), np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
         if states.shape != (n, *np.shape(t)):
             raise ValueError(
                 f"{what}: y has the shape {states.shape} for {times.size} times; expected ({n},) for a number t, or a "
                 "column for each time."
             )
-        return list(zip(times.tolist(), np.ascontiguousarray(states.reshape(n, -1).T), strict=True))
-
-    def _extra(self, params: Any) -> tuple[np.ndarray, ...]:
-        """Return a tuple with the parameters, the last argument of functions; it is empty if there are none."""
-        if isinstance(params, Mapping):
-            params = self.named_parameters(params)
-        params = self.params if params is None else params
-        return () if params is None else (np.asarray(params, float),)
+        params = self.named_parameters(params) if isinstance(params, Mapping) else params
+        params = self.params if params is None else np.atleast_1d(np.asarray(params, float))
+        args = () if params is None else (np.broadcast_to(params, (times.size, params.shape[-1])).copy(),)
+        return list(zip(times.tolist(), np.ascontiguousarray(states.reshape(n, -1).T), *args, strict=True))
 
     def named_parameters(self, given: Mapping[Any, Any]) -> np.ndarray:
         """Return the values of all parameters; see `Problem.named_parameters`."""
@@ -155,14 +151,13 @@ class MechanicsProblem(Problem):
     def motion_at(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return the derivative (q', u') of one state, computed by functions that are not compiled."""
         out = np.empty(len(self.names.state))
-        self.motion.rhs(t, np.ascontiguousarray(y, float), out, *self._extra(None))
+        self.motion.rhs(t, np.ascontiguousarray(y, float), out, *([] if self.params is None else [self.params]))
         return out
 
-    def _solved(self, t: float, y: np.ndarray, params: Any) -> tuple[int, np.ndarray, np.ndarray]:
+    def _solved(self, t: float, y: np.ndarray, *args: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Return the rank of the constraints, u' and the multipliers at a state."""
         rates, accelerations, multipliers = map(np.empty, self.names.sizes)
-        rank = self.motion.solved(t, y, rates, accelerations, multipliers, *self._extra(params))
-        return rank, accelerations, multipliers
+        return self.motion.solved(t, y, rates, accelerations, multipliers, *args), accelerations, multipliers
 
     def start(
         self, q0: Any, u0: Any, params: Any = None, *, t: float | None = None, independent: Iterable[str] | None = None
@@ -217,7 +212,7 @@ class MechanicsProblem(Problem):
 
     def _constraints_described(self) -> str:
         m, n = len(self.names.velocities), len(self.names.speeds)
-        rank = self._solved(self._begin, self.y0, None)[0] if m else 0
+        rank = self.multipliers(self._begin, self.y0).rank if m else 0
         free = f"{n - rank} degree{'s' * (n - rank != 1)} of freedom"
         if m == 0:
             return f"none, {free}"

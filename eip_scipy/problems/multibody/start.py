@@ -14,7 +14,6 @@ from ...core.invariants import Invariant, with_args
 from ...core.names import nearest
 from ...core.project import project
 from ...engine.trust import ProjectionWarning
-from .motion import Sizes
 
 __all__ = ["MET", "Names", "by_name", "name_of", "nearest_start", "started"]
 
@@ -41,9 +40,9 @@ class Names(NamedTuple):
         return (*self.coordinates, *self.speeds)
 
     @property
-    def sizes(self) -> Sizes:
+    def sizes(self) -> tuple[int, int, int]:
         """Return the numbers of coordinates, speeds and constraints on velocities."""
-        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
+        return len(self.coordinates), len(self.speeds), len(self.velocities)
 
 
 def name_of(key: Any) -> str:
