@@ -172,6 +172,18 @@ class _Maker:
         slopes, gradient = self._slopes(jacobian, velocities)
         return Parts(self._fill(velocities, slopes), values, gradient, self._energies())
 
+    def _gradient_of(self, function: Any, x: Array, shape: tuple[int, ...] = ()) -> Any:
+        """Return ``grad(t, x, out)`` of a function whose value has this `shape`; `x` is its argument at the start."""
+        if self.compiles:
+            from ...core.jitted_gradients import gradient_by_duals
+
+            by_duals = gradient_by_duals(function, x.size, shape, False)
+            # Python may call this function, but not what `by_duals` is made of.
+            return self.made(lambda t, x, out: by_duals(t, x, out))
+        sizes = np.where(x != 0, np.abs(x), np.abs(x).max(initial=0.0) or 1.0)
+        numerical = steps.NumericalGradient(function, (), True, self.start[0], x, sizes, ())
+        return lambda t, x, out: put(numerical(t, x), out)
+
     def _first_derivatives(self) -> tuple[Any, Any]:
         """Return two functions of the constraints on positions.
 
@@ -179,6 +191,7 @@ class _Maker:
         fills `out` (m, nq) with their derivatives with respect to q.
         """
         given, constraints, nq, m, put = *map(self.of.get, ("jacobian", "constraints")), self.nq, self.m, self.put
+        q = self.start[1][:nq]
 
         def as_given(t, y, out):
             found = given(t, y)
@@ -188,23 +201,21 @@ class _Maker:
         if m == 0:
             return self.made(lambda t, y, dq, out: None), self.made(lambda t, y, out: None)
         if self.compiles:
-            from ...core.jitted_gradients import gradient_by_duals, rate_by_duals
+            from ...core.jitted_gradients import rate_by_duals
 
-            form = self.given["constraints"], nq, (m,), False
-            along = rate_by_duals(*form)
-            by_duals: Any = None if given else gradient_by_duals(*form)
-            jacobian = as_given if given else lambda t, y, out: by_duals(t, y[:nq], out)
-            return self.made(lambda t, y, dq, out: put(along(t, y[:nq], dq), out)), self.made(jacobian)
-        t, y = self.start
-        slopes = _numerical(lambda _, x: np.asarray(constraints(x[-1], x)), 0.0, np.append(y[:nq], t))
+            along = rate_by_duals(self.given["constraints"], nq, (m,), False)
+            rate = self.made(lambda t, y, dq, out: put(along(t, y[:nq], dq), out))
+            slopes: Any = None if given else self._gradient_of(self.given["constraints"], q, (m,))
+            return rate, self.made(as_given if given else lambda t, y, out: slopes(t, y[:nq], out))
+        slopes = self._gradient_of(lambda _, x: np.asarray(constraints(x[-1], x)), np.append(q, self.start[0]))
 
-        def rate(t, y, dq, out):
-            out[:] = slopes(0.0, np.append(y[:nq], t)) @ np.append(dq, 1.0)
+        def by_q_and_t(t, y):
+            found = np.empty((m, nq + 1))
+            slopes(0.0, np.append(y[:nq], t), found)
+            return found
 
-        def by_slopes(t, y, out):
-            out[:] = slopes(0.0, np.append(y[:nq], t))[:, :nq]
-
-        return rate, as_given if given else by_slopes
+        rate = lambda t, y, dq, out: put(by_q_and_t(t, y) @ np.append(dq, 1.0), out)  # noqa: E731
+        return rate, as_given if given else lambda t, y, out: put(by_q_and_t(t, y)[:, :nq], out)
 
     def _values(self, rate: Any) -> tuple[Any, Any]:
         """Return ``values(t, y, out)``, all constraints, and ``velocities(t, y, out)``, those on velocities.
@@ -322,17 +333,4 @@ class _Maker:
         if not (total or potential):
             return ()
         value = total or self.made(with_potential)
-        if self.compiles:
-            from ...core.jitted_gradients import gradient_by_duals
-
-            slopes = gradient_by_duals(value, nq + n, (), False)
-            # Python may call this function, but not what `slopes` is made of.
-            return (Energy(described, value, self.made(lambda t, y, out: slopes(t, y, out)), power),)
-        numerical = _numerical(value, *self.start)
-        return (Energy(described, value, lambda t, y, out: put(numerical(t, y), out), power),)
-
-
-def _numerical(function: Callable[..., Any], t: float, x: Array) -> Callable[..., Array]:
-    """Return the numerical gradient ``grad(t, x)`` of a Python function, whose arguments are `t` and `x` at first."""
-    sizes = np.where(x != 0, np.abs(x), np.abs(x).max(initial=0.0) or 1.0)
-    return steps.NumericalGradient(function, (), True, t, x, sizes, ())
+        return (Energy(described, value, self._gradient_of(value, self.start[1]), power),)

@@ -260,7 +260,8 @@ def mechanics_problem(
         raise ValueError(f"{name}: rank_tolerance must be a number between 0 and 1, got {shown(tolerance)}.")
     args, nq = () if params is None else (params,), len(names.coordinates)
     functions, once = (motion(fill, names.sizes, tolerance) for fill in (parts.fill, plain(parts.fill)))
-    fun, held = bind(once.rhs, params), None if independent is None else tuple(independent)
+    given = [independent] if isinstance(independent, str) else independent
+    fun, held = bind(once.rhs, params), None if given is None else tuple(given)
     examined = _constraints_invariant(plain(parts.values), plain(parts.gradient), names, args)
     kept = _constraints_invariant(parts.values, parts.gradient, names, args)
     y0, solved = started(name, names, examined, *start, params, t, held)
