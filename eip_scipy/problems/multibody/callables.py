@@ -21,9 +21,7 @@ __all__ = ["RANK_TOLERANCE", "mechanism"]
 
 # Distance within which gradients of constraints, each scaled to length 1, count as dependent.
 RANK_TOLERANCE = 1e-5
-# Bound for the rounding of functions that are linear in the speeds, relative to their values.
-LINEAR = 1e-9
-# Bound for the rounding of mass matrices, relative to their entries, and of kinetic energies, relative to their terms.
+# Bound for rounding, relative to the values or terms: of functions that must be linear, masses and kinetic energies.
 ROUNDING = 1e-9
 # Bound for the errors of given derivatives, relative to the computed ones or, if they are larger, to the speeds.
 DERIVED = 1e-6
@@ -257,7 +255,7 @@ def _require_linear(of: Mapping[str, Any], t: float, q: np.ndarray, n: int) -> N
     for what in of.keys() & {"kinematics", "velocity_constraints"}:
         values = [np.asarray(of[what](t, np.append(q, u)), float) for u in (0 * one, one, two, one + two)]
         wrong = np.abs(values[3] - values[1] - values[2] + values[0])
-        if not (wrong <= LINEAR * np.abs(values).max(initial=0.0)).all():
+        if not (wrong <= ROUNDING * np.abs(values).max(initial=0.0)).all():
             raise ValueError(
                 f"mechanism: {what} must be linear in the speeds, but component {np.argmax(wrong)} of its value is "
                 "not. Write it so that the factors of the speeds depend on t and q only."

@@ -130,19 +130,13 @@ def parts_of_functions(
     if made is None:
         made = _Maker(given, names, start, longest, compiles=False).parts()._replace(note=note + why)
         made.fill.not_jitted = why  # type: ignore[attr-defined]
-    origin = (parts_of_functions, (given, outputs, names, start, longest))
-    return made._replace(outputs=_output_functions(outputs, names), origin=origin)
-
-
-def _output_functions(outputs: Mapping[str, Any], names: Names) -> Outputs | None:
-    """Return `Outputs` that call the user's functions; None if there are none."""
     functions = [of_state(item, "tqu", len(names.coordinates)) for item in outputs.values()]
-    size = len(names.state)
 
-    def fill(t, x, out):
-        out[:] = [function(t, x[:size]) for function in functions]
+    def observed(t, x, out):
+        out[:] = [function(t, x[: len(names.state)]) for function in functions]
 
-    return Outputs(tuple(outputs), fill) if functions else None
+    origin = (parts_of_functions, (given, outputs, names, start, longest))
+    return made._replace(outputs=Outputs(tuple(outputs), observed) if functions else None, origin=origin)
 
 
 class _Maker:

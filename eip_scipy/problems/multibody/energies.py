@@ -120,7 +120,8 @@ class Examined:
             rates, terms, bound = self.rates(item)
             self._require_power(item, rates, terms)
             if np.abs(rates).max() <= bound and terms.max() > 0 and item.power is None:
-                return self._invariant(item, "energy"), f"invariant, {item.description}"
+                energy = Invariant(item.value, item.gradient, args=self.args, in_place=True, name="energy")
+                return energy, f"invariant, {item.description}"
             moving = terms > CONSTANT * terms.max()
             slowness.append(float(np.median(np.abs(rates[moving]) / terms[moving])) if moving.any() else 0.0)
         least = min(slowness)
@@ -148,9 +149,6 @@ class Examined:
                 "power to have it computed."
             )
 
-    def _invariant(self, item: Energy, name: str) -> Invariant:
-        return Invariant(item.value, item.gradient, args=self.args, in_place=True, name=name)
-
     def momenta_of(self, candidates: Sequence[Energy], kept: Sequence[Invariant]) -> tuple[Invariant, ...]:
         """Return the candidates that are constant and independent of the invariants in `kept` and of each other.
 
@@ -159,7 +157,7 @@ class Examined:
         found: list[Invariant] = []
         for item in candidates if len(self.states) >= FEWEST else ():
             rates, _, bound = self.rates(item)
-            momentum = self._invariant(item, item.description)
+            momentum = Invariant(item.value, item.gradient, args=self.args, in_place=True, name=item.description)
             if np.abs(rates).max() <= bound and self._is_independent(momentum, [*kept, *found]):
                 found.append(momentum)
         return tuple(found)
@@ -199,8 +197,7 @@ class Examined:
             return total
 
         def gradient(t, y, out, *params):
-            for k in range(y.size):
-                out[k] = 0.0
+            out[:] = 0.0
             for k in places:
                 out[k] = 2.0 * y[k]
 

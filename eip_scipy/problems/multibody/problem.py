@@ -307,14 +307,12 @@ def _require_accelerations(
 def _constraints_invariant(values: Any, gradient: Any, names: Names, args: tuple[Any, ...]) -> tuple[Invariant, ...]:
     """Return a tuple with one invariant that has all constraints as values; empty if there are no constraints."""
     every = (*names.positions, *names.velocities)
-    size, target = len(every), np.zeros(len(every))
-    if size == 0:
-        return ()
     item = Invariant(
-        vector(values, size), gradient, target=target, args=args, size=size, name="constraints", in_place=True
-    )
+        vector(values, len(every)), gradient, target=np.zeros(len(every)), args=args, size=len(every) or None,
+        name="constraints", in_place=True,
+    )  # fmt: skip
     item.value_names = every
-    return (item,)
+    return (item,) if every else ()
 
 
 def _at_speed(item: Invariant, t: float, y: np.ndarray, nq: int, speed: float) -> Any:

@@ -172,23 +172,18 @@ def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.
             f"{what}: the start violates {violated} List in independent= the components whose values are to be kept; "
             "the others are then computed."
         )
-    raise ValueError(
-        f"{what}: no start was found that meets {violated} {_why_not(item, values, gradient, worst)}List fewer "
-        "components in independent=, or give a guess that is nearer to a solution."
-    )
-
-
-def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return why the constraint `worst` is not met; `gradient` has the derivatives that could help."""
     sizes = np.linalg.norm(gradient, axis=1)
-    if sizes[worst] <= DEPENDENT * sizes.max():
-        return "It does not depend on any component that is computed. "
     found = np.linalg.svd(gradient[sizes > 0] / sizes[sizes > 0, None], compute_uv=False)
-    left = np.abs(values) / np.where(sizes > 0, sizes, np.inf)
+    left, why = np.abs(values) / np.where(sizes > 0, sizes, np.inf), ""
     others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
-    if others and np.count_nonzero(found > DEPENDENT * found.max()) < np.count_nonzero(sizes):
-        return (
+    if sizes[worst] <= DEPENDENT * sizes.max():
+        why = "It does not depend on any component that is computed. "
+    elif others and np.count_nonzero(found > DEPENDENT * found.max()) < np.count_nonzero(sizes):
+        why = (
             f"It contradicts {', '.join(others)}, because the gradients of these constraints depend on each other "
             "at the end of the search. If no start can meet all of them, remove one. "
         )
-    return ""
+    raise ValueError(
+        f"{what}: no start was found that meets {violated} {why}List fewer components in independent=, or give a guess "
+        "that is nearer to a solution."
+    )

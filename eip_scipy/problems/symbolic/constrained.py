@@ -161,11 +161,9 @@ def _with_inputs(
     fill = made(Arguments(names, system.parameters))
     for _, given in reversed(system.inputs):
         fill = _with_input(fill, given, len(system.variables))
-    if plain := [repr(name) for name, given in system.inputs if not is_jitted(given)]:
-        what = f"input {plain[0]} is a Python function; jit it"
-        if len(plain) > 1:
-            what = f"inputs {', '.join(plain)} are Python functions; jit them"
-        fill.not_jitted = f"{what} by numba.njit, which makes runs up to about 150 times faster"  # type: ignore[attr-defined]
+    if plain := [name for name, given in system.inputs if not is_jitted(given)]:
+        why = f"input {plain[0]!r} is a Python function; jit it by numba.njit, which makes runs about 150 times faster"
+        fill.not_jitted = why  # type: ignore[attr-defined]
     return fill
 
 
