@@ -149,7 +149,8 @@ class _Maker:
         self, given: Mapping[str, Any], names: Names, start: tuple[float, Array], longest: float, *, compiles: bool
     ) -> None:
         self.given, self.start, self.longest, self.compiles = given, start, longest, compiles
-        self.nq, self.n, self.m, self.rows = nq, _, _, _ = [len(item) for item in names]
+        self.nq, self.n, self.m, self.rows = map(len, names)
+        nq = self.nq
         self.of: Any = {name: self.made(of_state(item, TAKES[name], nq)) for name, item in given.items()}
         self.kinematics = self.of.get("kinematics") or self.made(lambda t, y: y[nq:])
         self.missing = self.made(lambda t, y: y)  # stands for constraints that are missing; no value of it is used
@@ -254,8 +255,9 @@ class _Maker:
                 rates, found = kinematics(t, x), others(t, x)
                 for k in range(nq):
                     change = rates[k] - rest[k]
-                    for i in range(m if change != 0.0 else 0):
-                        G[i, j] += J[i, k] * change
+                    if change != 0.0:
+                        for i in range(m):
+                            G[i, j] += J[i, k] * change
                 for i in range(m, rows):
                     G[i, j] = found[i - m] - zero[i - m]
                 x[nq + j] = 0.0
