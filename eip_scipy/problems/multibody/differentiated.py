@@ -149,8 +149,7 @@ class _Maker:
         self, given: Mapping[str, Any], names: Names, start: tuple[float, Array], longest: float, *, compiles: bool
     ) -> None:
         self.given, self.start, self.longest, self.compiles = given, start, longest, compiles
-        self.nq, self.n, self.m, self.rows = map(len, names)
-        nq = self.nq
+        nq, _, _, _ = self.sizes = [len(item) for item in names]
         self.of: Any = {name: self.made(of_state(item, TAKES[name], nq)) for name, item in given.items()}
         self.kinematics = self.of.get("kinematics") or self.made(lambda t, y: y[nq:])
         self.missing = self.made(lambda t, y: y)  # stands for constraints that are missing; no value of it is used
@@ -185,7 +184,7 @@ class _Maker:
         ``rate(t, y, dq, out)`` fills `out` (m,) with their rates of change for q' = dq, and ``jacobian(t, y, out)``
         fills `out` (m, nq) with their derivatives with respect to q.
         """
-        given, constraints, nq, m, put = *map(self.of.get, ("jacobian", "constraints")), self.nq, self.m, self.put
+        given, constraints, (nq, _, m, _), put = *map(self.of.get, ("jacobian", "constraints")), self.sizes, self.put
         q = self.start[1][:nq]
 
         def as_given(t, y, out):
@@ -218,7 +217,7 @@ class _Maker:
         The latter are the rates of the constraints on positions, and then `velocity_constraints`.
         """
         positions, others = (self.of.get(name, self.missing) for name in ("constraints", "velocity_constraints"))
-        kinematics, put, nq, m = self.kinematics, self.put, self.nq, self.m
+        kinematics, put, (nq, _, m, _) = self.kinematics, self.put, self.sizes
 
         def velocities(t, y, out):
             dq = np.empty(nq)
@@ -241,7 +240,7 @@ class _Maker:
         the speeds; `gradient` fills `out` with all derivatives by the state.
         """
         kinematics, others = self.kinematics, self.of.get("velocity_constraints", self.missing)
-        nq, n, m, rows, put, difference = self.nq, self.n, self.m, self.rows, self.put, self.difference
+        (nq, n, m, rows), put, difference = self.sizes, self.put, self.difference
 
         def slopes(t, y, J, G):
             jacobian(t, y, J)
@@ -283,8 +282,7 @@ class _Maker:
     def _fill(self, velocities: Any, slopes: Any) -> Any:
         """Return the argument ``fill(t, y, out)`` of `motion`."""
         mass, forces, given, kinematics = self.of["mass"], self.of["forces"], self.of.get("gamma"), self.kinematics
-        put, difference, longest = self.put, self.difference, self.longest
-        nq, n, m, rows = self.nq, self.n, self.m, self.rows
+        put, difference, longest, (nq, n, m, rows) = self.put, self.difference, self.longest, self.sizes
         F, G = n * n, n * n + n
         gamma, rates = G + rows * n, G + rows * n + rows
 
@@ -317,7 +315,7 @@ class _Maker:
     def _energies(self) -> tuple[Energy, ...]:
         """Return the energy, if it is known."""
         mass, potential, total, power = map(self.of.get, ("mass", "potential_energy", "energy", "power"))
-        nq, n, described = self.nq, self.n, "energy" if total else "u M u / 2 + potential_energy"
+        (nq, n, _, _), described = self.sizes, "energy" if total else "u M u / 2 + potential_energy"
 
         def with_potential(t, y):
             M, kinetic = mass(t, y), 0.0
