@@ -345,7 +345,8 @@ class _Compiler:
             if self._is_off:
                 raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
             if not is_jitted(fun):
-                raise NotCompilableError(f"{name} is not a Numba function; decorate it with @numba.njit")
+                why = getattr(fun, "not_jitted", "")  # of a function of this package that calls one of the user
+                raise NotCompilableError(why or f"{name} is not a Numba function; decorate it with @numba.njit")
             from .numba_bridge import compiled  # which loads Numba
 
             function = compiled(fun, Kind(shape, size, self._p, self._dtype, real, scalars=self._scalars, **form), name)

@@ -319,6 +319,9 @@ class _Collector:
             chunk=self.size,
             component_names=ready.problem.component_names,
         )
+        count, request = len(members["t"]), plan.task.request
+        params = None if request.params is None else self.everyone.params[first : first + count]
+        object.__setattr__(result, "_members", (request.fun, params))  # not a field: fields are items of the result
         at_end = result.pop("end_invariants")
         if not plan.held:
             result.update(trajectories=None, invariants=at_end)

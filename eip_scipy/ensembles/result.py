@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core.problem import Problem
+from ..core.results import Multipliers
 from ..engine.data import NFEV, NJEV, NLU, REJECTED
 from ..run.fields import Field, component_names, dataset, distinct, time_name
 from ..run.results import Result, steps
@@ -90,6 +92,12 @@ class EnsembleResult(Result):
     variations : ndarray, shape (members, n, k) or (members, m, n, k)
         Columns of derivatives if ``variations=`` was given, in the saved states if `trajectories` has them, else in the
         last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
+    outputs : dict of str to ndarray, shape (members,) or (members, m)
+        For a mechanical system with ``outputs=``: values of these quantities in the same states, computed when they are
+        first requested; nan where there is no state.
+    multipliers : Multipliers
+        For a mechanical system with constraints, likewise: ``values`` (members, c) or (members, c, m) for c constraints
+        and ``rank`` (members,) or (members, m), which is 0 where there is no state.
     first : int
         Number of the first member; it is 0 except in the results that a `callback` receives.
     stopped : bool
@@ -128,6 +136,32 @@ class EnsembleResult(Result):
     method: str
     h: float | None
     chunk: int
+    outputs: dict[str, np.ndarray]
+    multipliers: Multipliers
+
+    def _observed(self) -> dict[str, Any]:
+        """Return the fields that the problem computes from the states of each member, see `Problem.observed`."""
+        problem, params = vars(self).get("_members", (None, None))
+        if not isinstance(problem, Problem):
+            return {}
+        states = self.y[:, :, None] if self.trajectories is None else self.trajectories
+        saved = self.trajectories is not None
+        known = np.isfinite(states).all(axis=1) & (self.status[:, None] != NOT_RUN)
+        times = np.broadcast_to(self.times if saved else self.t[:, None], known.shape)
+        k, j = np.nonzero(known)
+        found = problem.observed(times[k, j], states[k, :, j].T, None if params is None else params[k])
+
+        def whole(values: np.ndarray, unset: Any = np.nan) -> np.ndarray:
+            out = np.full((len(known), *values.shape[:-1], known.shape[1]), unset)
+            out[k, ..., j] = np.moveaxis(values, -1, 0)
+            return out if saved else out[..., 0]
+
+        if "outputs" in found:
+            found["outputs"] = {name: whole(values) for name, values in found["outputs"].items()}
+        if "multipliers" in found:
+            names, values, rank = found["multipliers"]
+            found["multipliers"] = Multipliers(names, whole(values), whole(rank, 0))
+        return found
 
     def to_xarray(self, names: Any = None) -> Any:
         """Return the members as an `xarray.Dataset`.

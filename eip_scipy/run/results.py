@@ -79,7 +79,7 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     """
     if not isinstance(result, OptimizeResult):
         raise TypeError(f"save: expected a result of integrate, ensemble or solve_ivp, got {shown(result)}.")
-    if isinstance(result, IntegrationResult):
+    if isinstance(result, Result):
         result._observe()
     arrays: dict[str, np.ndarray] = {}
     found = {name: None if callable(value) else encoded(name, value, arrays) for name, value in result.items()}
@@ -233,10 +233,24 @@ class Result(Fields):
 
     def _observe(self) -> None:
         """Compute the fields for outputs and multipliers if the problem has them and they have not been computed."""
+        if not any(name in self for name in OBSERVED):
+            self.update(self._observed())
+
+    def _observed(self) -> dict[str, Any]:
+        """Return the fields that the problem computes from the states, see `Problem.observed`."""
         origin = vars(self).get("_origin")
         arguments = {} if origin is None else origin.arguments
-        if isinstance(arguments.get("fun"), Problem) and not any(name in self for name in OBSERVED):
-            self.update(arguments["fun"].observed(self.t, self.y, arguments["params"]))
+        problem = arguments.get("fun")
+        return problem.observed(self.t, self.y, arguments["params"]) if isinstance(problem, Problem) else {}
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Compute outputs and multipliers, for which an unpickled result has no functions; return what is pickled."""
+        self._observe()
+        return super().__reduce_ex__(protocol)
+
+    def __getstate__(self) -> None:
+        """Return None: a pickle excludes attributes that are not fields, such as the functions of the run."""
+        return None
 
     def __dir__(self) -> list[str]:
         methods = ("continue_to", "plot", "save", "to_dataframe", "to_xarray")
@@ -406,12 +420,3 @@ class IntegrationResult(Result):
     def __repr__(self) -> str:
         """Return the fields as text, without `units` and `epoch` if they are not set."""
         return repr(OptimizeResult({key: value for key, value in self.items() if key not in UNSET or value}))
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Compute outputs and multipliers, for which an unpickled result has no functions; return what is pickled."""
-        self._observe()
-        return super().__reduce_ex__(protocol)
-
-    def __getstate__(self) -> None:
-        """Return None: a pickle excludes attributes that are not fields, such as the functions of the run."""
-        return None

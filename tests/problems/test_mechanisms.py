@@ -121,7 +121,14 @@ def test_it_pickles_and_its_members_and_implicit_methods_keep_the_constraints(re
     one, two = (run(problem, 1e-6, t_span=(0, 1)) for problem in (chosen, again))
     np.testing.assert_array_equal(one.y, two.y)
     starts = np.array([[1.0, 0, 0, 0], [0, -1, 2, 0]])
-    assert off_the_circle(ensemble(released, (0, 1), starts, method=EIPDOP853, rtol=1e-6, atol=1e-6).y.T) < 1e-12
+    options = {"method": EIPDOP853, "rtol": 1e-6, "atol": 1e-6}
+    members, saved = (ensemble(released, (0, 1), starts, t_eval=t, **options) for t in (None, [0, 0.5, 1]))
+    assert off_the_circle(members.y.T) < 1e-12
+    for found, y in ((members, members.y), (pickle.loads(pickle.dumps(saved)), saved.trajectories)):
+        np.testing.assert_array_equal(found.outputs["height"], y[:, 1])
+        forces = (y[:, 2:] ** 2).sum(axis=1) - G * y[:, 1]
+        np.testing.assert_allclose(found.multipliers.values[:, 0], forces, rtol=1e-12)
+        assert found.multipliers.unique.all()
     implicit = {"t_span": (0, 1.0), "method": EIPRadau, "rtol": 1e-6, "atol": 1e-6}
     found = integrate(released, **implicit)
     assert len(found.target) == 2
@@ -359,20 +366,13 @@ def test_masses_that_the_constraints_make_positive():
 # Mechanisms with known motions.
 
 
-def interpreted(problem):
-    """Return the equations and the constraints of a problem, not compiled."""
-    (kept,) = problem.constraints
-    target = np.zeros(kept.size)
-    options = {"target": target, "size": target.size, "in_place": True, "name": "constraints"}
-    functions = [getattr(item, "py_func", item) for item in (kept.function, kept.gradient)]
-    return problem.motion_at, Invariant(*functions, **options)
-
-
 def test_no_step_ends_next_to_a_singular_position():
     problem = examples.n_four_bar(1, t_end=3.0)
-    fun, constraints = interpreted(problem)
-    given = {"invariants": constraints, "blocks": problem.blocks, "method": EIPDOP853, "save_every": 1}
-    found = integrate(fun, problem.t_span, problem.y0, rtol=3e-11, atol=3e-11, **given)
+    (kept,) = problem.constraints
+    functions = [getattr(item, "py_func", item) for item in (kept.function, kept.gradient)]
+    kept = Invariant(*functions, target=kept.target, size=kept.size, in_place=True, name="constraints")
+    given = {"invariants": kept, "blocks": problem.blocks, "method": EIPDOP853, "save_every": 1}
+    found = integrate(problem.motion_at, problem.t_span, problem.y0, rtol=3e-11, atol=3e-11, **given)
     assert found.trusted
     assert found.diagnostics.n_rejected_projections == 0
     assert found.nfev < 1500

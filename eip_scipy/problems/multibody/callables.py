@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from ...core.derivatives import time_of_motion
 from ...core.inputs import real_array, shown
 from ...core.problem import component_names
-from .differentiated import parts_of_functions
+from .differentiated import TAKES, difference, of_state, parts_of_functions
 from .energies import states_near
-from .parts import Given, Parts, required_outputs
+from .motion import plain
+from .parts import Parts, required_outputs
 from .problem import MechanicsProblem, mechanics_problem
 from .start import Names
 
@@ -19,10 +21,10 @@ __all__ = ["RANK_TOLERANCE", "mechanism"]
 
 # Distance within which gradients of constraints, each scaled to length 1, count as dependent.
 RANK_TOLERANCE = 1e-5
-# Bound for the rounding of functions that are linear in the speeds, relative to their values.
-LINEAR = 1e-9
-# Bound for the rounding of mass matrices, relative to their entries, and of kinetic energies, relative to their terms.
+# Bound for rounding, relative to the values or terms: of functions that must be linear, masses and kinetic energies.
 ROUNDING = 1e-9
+# Bound for the errors of given derivatives, relative to the computed ones or, if they are larger, to the speeds.
+DERIVED = 1e-6
 
 
 def mechanism(
@@ -72,19 +74,17 @@ def mechanism(
     t_span : tuple of float, optional
         Start and end of the interval. If it is omitted, the start is at t = 0.
     velocity_constraints : callable, optional
-        ``velocity_constraints(t, q, u)``, (k,), linear in u, the expressions that further constraints set to 0. These
-        are constraints that are not derivatives of `constraints`, such as those of rolling wheels.
+        ``velocity_constraints(t, q, u)``, (k,), linear in u, the expressions that further constraints set to 0, which
+        are not derivatives of `constraints`, such as those of rolling wheels.
     kinematics : callable, optional
         ``kinematics(t, q, u)``, the derivatives q', linear in u. Default: q' = u.
     jacobian, gamma : callable, optional
         ``jacobian(t, q)``, the derivatives (m, n) of `constraints` with respect to q, and ``gamma(t, q, u)``, (m + k,),
-        the second time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. By default
-        both are computed. If they are given, they are compared with computed derivatives at the start.
-    energy : callable, optional
-        ``energy(t, q, u)``, the total energy.
-    potential_energy : callable, optional
-        ``potential_energy(t, q)``, for the energy u M u / 2 + potential_energy. If neither this nor `energy` is given,
-        the energy is not known.
+        the second time derivatives of `constraints` and the first ones of `velocity_constraints` for u' = 0. Default:
+        computed. Given ones are compared with differences near the start.
+    energy, potential_energy : callable, optional
+        ``energy(t, q, u)``, the total energy, or ``potential_energy(t, q)`` for u M u / 2 + potential_energy. Without
+        one of them the energy is not known.
     power : callable, optional
         ``power(t, q, u)``, the rate of change of the energy, which then becomes a `Balance`. Default: it is computed.
     outputs : mapping, optional
@@ -109,19 +109,16 @@ def mechanism(
     ------
     ValueError
         If shapes do not fit, a function that must be linear in u is not, the start does not meet the constraints, the
-        mass matrix is not symmetric, it is not positive for motions that the constraints allow, or a given derivative
-        or power is wrong.
+        mass matrix is not symmetric or not positive, or a given derivative or power is wrong.
 
     Notes
     -----
     If all functions are jitted by Numba (except those of `outputs`), the whole problem is compiled, and first
-    derivatives come from dual numbers. Plain Python functions are called from Python, which takes much longer; first
-    derivatives then come from complex steps, or from differences if a function is not analytic. In both cases second
-    derivatives, such as `gamma`, are differences of the first ones. Next to a singular position, at which gradients of
-    constraints are dependent, their rounding is magnified: pass `gamma` if a run passes through such positions.
-
-    As in all compiled code, a number or an array that a jitted function takes from outside has the value that it had
-    when the function was compiled.
+    derivatives come from dual numbers; arrays and numbers from outside have the values of the time of compilation.
+    Plain Python functions are called from Python, which takes much longer; first derivatives then come from complex
+    steps, or from differences. Second derivatives, such as `gamma`, are differences of the first ones. Next to a
+    singular position, at which gradients of constraints are dependent, their rounding is magnified: pass `gamma` if a
+    run passes through such positions.
 
     Examples
     --------
@@ -135,54 +132,52 @@ def mechanism(
     >>> bool(abs(run.y[0] ** 2 + run.y[1] ** 2 - 1).max() < 1e-14)
     True
     """
-    given = Given(
-        mass, forces, constraints, velocity_constraints, kinematics, jacobian, gamma, energy, potential_energy, power
-    )
-    given = _checked(given)
-    t = 0.0 if t_span is None else float(t_span[0])
-    q = _given_state("q0", q0, coordinates)
-    u = _given_state("u0", u0, speeds)
-    called = given.called()
-    _require_shapes(called, t, q, u)
-    _require_symmetric(np.asarray(called.mass(q), float))
-    m = 0 if called.constraints is None else len(called.constraints(t, q))
-    k = 0 if called.velocity_constraints is None else len(called.velocity_constraints(t, q, u))
-    _require_linear(called, t, q, u)
-    names = _names(coordinates, speeds, constraint_names, (q.size, u.size, m, k))
-    given = given._replace(outputs=_as_outputs(outputs, names, t, q, u))
-    interval = np.inf if t_span is None else abs(float(t_span[1]) - t)
-    parts = parts_of_functions(given, names, t, q, u, interval)
+    given = {
+        "mass": mass, "forces": forces, "constraints": constraints, "velocity_constraints": velocity_constraints,
+        "kinematics": kinematics, "jacobian": jacobian, "gamma": gamma, "energy": energy,
+        "potential_energy": potential_energy, "power": power,
+    }  # fmt: skip
+    given = {what: _checked(what, item) for what, item in given.items() if item is not None}
+    t, interval = (0.0, np.inf) if t_span is None else (float(t_span[0]), abs(float(t_span[1]) - float(t_span[0])))
+    (of_q, q), (of_u, u) = _named("q0", q0, coordinates, "q"), _named("u0", u0, speeds, "u")
+    of, y = {what: of_state(item, TAKES[what], q.size) for what, item in given.items()}, np.append(q, u)
+    m, k = (np.size(of[what](t, y)) if what in of else 0 for what in ("constraints", "velocity_constraints"))
+    _require_shapes(of, t, y, (q.size, u.size, m, k))
+    _require_linear(of, t, q, u.size)
+    g = _numbered(constraint_names, "g", m + k)
+    names = Names(of_q, of_u, g[:m], (*(f"{item}'" for item in g[:m]), *g[m:]))
+    if "t" in names.state:
+        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
+    # Constraints may depend on time. Differences over more time than this would be wrong while little moves.
+    if not 0 < (longest := interval) < np.inf:
+        moving = time_of_motion(q, np.asarray(of["kinematics"](t, y), float) if "kinematics" in of else u)
+        longest = max(1.0, moving) if moving < np.inf else 1.0
+    parts = parts_of_functions(given, _checked_outputs(outputs, names, t, y), names, (t, y), longest)
     problem = mechanics_problem(
         name, parts, names, t, (q0, u0), None, independent, rank_tolerance, t_span=t_span, **others
     )
-    if given.jacobian is not None or given.gamma is not None:
-        alone = parts_of_functions(given._replace(jacobian=None, gamma=None), names, t, q, u, interval, compiles=False)
-        _require_derivatives(called, alone, problem, t)
-    _require_positive(parts, names, t, problem.y0, rank_tolerance)
+    _require_derivatives(of, parts, problem, t, longest)
+    _require_masses(parts, names, t, problem.y0, rank_tolerance)
     return problem
 
 
-def _checked(given: Given) -> Given:
-    """Return `given` with arrays of floats for mass and forces; raise TypeError if another item is not a function."""
-    mass, forces = given.mass, given.forces
-    if not callable(mass):
-        M = real_array("mass", mass)
-        mass = np.diag(M) if M.ndim == 1 else M
-    if not callable(forces):
-        forces = np.atleast_1d(real_array("forces", forces))
-    for name, value in given._asdict().items():
-        if name not in ("mass", "forces") and value is not None and not callable(value):
-            raise TypeError(f"mechanism: {name} must be a function, got {shown(value)}.")
-    return given._replace(mass=mass, forces=forces)
+def _checked(what: str, item: Any) -> Any:
+    """Return a function, or mass and forces as arrays; raise TypeError if another argument is not a function."""
+    if callable(item):
+        return item
+    if what not in ("mass", "forces"):
+        raise TypeError(f"mechanism: {what} must be a function, got {shown(item)}.")
+    values = np.atleast_1d(real_array(what, item))
+    return np.diag(values) if what == "mass" and values.ndim == 1 else values
 
 
-def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarray) -> dict[str, Callable[..., Any]]:
+def _checked_outputs(outputs: Any, names: Names, t: float, y: np.ndarray) -> dict[str, Callable[..., Any]]:
     """Return the functions of the outputs by name, after a check that they return numbers at the start."""
     found = required_outputs("mechanism", outputs, names.state)
     for name, item in found.items():
         if not callable(item):
             raise TypeError(f"mechanism: the output {name!r} must be a function f(t, q, u), got {shown(item)}.")
-        if np.shape(value := item(t, q.copy(), u.copy())) != ():
+        if np.shape(value := of_state(item, "tqu", len(names.coordinates))(t, y)) != ():
             raise ValueError(
                 f"mechanism: the output {name!r} has the shape {np.shape(value)}; expected a number. Give each "
                 "component a name of its own."
@@ -190,71 +185,47 @@ def _as_outputs(outputs: Any, names: Names, t: float, q: np.ndarray, u: np.ndarr
     return found
 
 
-def _given_state(what: str, given: Any, names: Any) -> np.ndarray:
-    """Return `given` as an array for the first calls of the functions; components missing from a mapping are 0."""
+def _named(what: str, given: Any, names: Any, letter: str) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the names of the components in `given`, and values for first calls of functions, by default 0."""
     if isinstance(given, Mapping):
         if names is None:
             raise TypeError(f"{what} is a mapping, which needs names; give coordinates= and speeds=, or an array.")
-        return np.array([float(given.get(name, 0.0)) for name in component_names(names, None)])
-    return np.atleast_1d(real_array(what, given)).astype(float)
+        names = component_names(names, None)
+        return names, np.array([float(given.get(name, 0.0)) for name in names])
+    values = np.atleast_1d(real_array(what, given)).astype(float)
+    return _numbered(names, letter, values.size), values
 
 
-def _names(coordinates: Any, speeds: Any, constraint_names: Any, sizes: Sequence[int]) -> Names:
+def _numbered(names: Any, letter: str, count: int) -> tuple[str, ...]:
+    return component_names([f"{letter}{j + 1}" for j in range(count)] if names is None else names, count)
+
+
+def _require_shapes(of: Mapping[str, Any], t: float, y: np.ndarray, sizes: Sequence[int]) -> None:
+    """Raise ValueError if a function returns an array of the wrong shape; those in `of` take (t, y)."""
     nq, n, m, k = sizes
-
-    def named(given: Any, letter: str, count: int) -> tuple[str, ...]:
-        return component_names([f"{letter}{j + 1}" for j in range(count)] if given is None else given, count)
-
-    positions = named(constraint_names, "g", m + k)
-    of_coordinates, of_speeds = named(coordinates, "q", nq), named(speeds, "u", n)
-    if "t" in (*of_coordinates, *of_speeds):
-        raise ValueError("mechanism: t is the time; give the coordinate or speed of this name another one.")
-    return Names(
-        of_coordinates,
-        of_speeds,
-        positions[:m],
-        (*(f"{item}'" for item in positions[:m]), *positions[m:]),
-    )
-
-
-def _require_shapes(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
-    """Raise ValueError if a function returns an array of the wrong shape."""
-    n = u.size
-
-    def require(what: str, found: Any, shape: tuple[int | str, ...]) -> None:
-        has = np.shape(found)
-        if len(has) != len(shape) or not all(b in (a, "m") for a, b in zip(has, shape, strict=True)):
-            raise ValueError(
-                f"mechanism: {what} has the shape {has}; expected ({', '.join(map(str, shape))}) for {q.size} "
-                f"coordinates and {n} speeds."
-            )
-
-    if given.kinematics is None and q.size != n:
+    if "kinematics" not in of and nq != n:
         raise ValueError(
-            f"mechanism: q0 has {q.size} coordinates, but u0 has {n} speeds. Give as many speeds as coordinates, or "
+            f"mechanism: q0 has {nq} coordinates, but u0 has {n} speeds. Give as many speeds as coordinates, or "
             "kinematics=, which computes q' from the speeds."
         )
-    shapes: dict[str, tuple[tuple[Any, ...], tuple[int | str, ...]]] = {
-        "mass": ((q,), (n, n)),
-        "forces": ((t, q, u), (n,)),
-        "constraints": ((t, q), ("m",)),
-        "velocity_constraints": ((t, q, u), ("m",)),
-        "kinematics": ((t, q, u), (q.size,)),
-        "energy": ((t, q, u), ()),
-        "power": ((t, q, u), ()),
-        "potential_energy": ((t, q), ()),
-    }
-    for what, (args, shape) in shapes.items():
-        if (fun := getattr(given, what)) is not None:
-            require(what, fun(*args), shape)
-    if given.jacobian is not None:
-        if given.constraints is None:
-            raise TypeError("mechanism: jacobian is given without constraints; give both, or omit jacobian.")
-        require("jacobian", given.jacobian(t, q), (len(given.constraints(t, q)), q.size))
+    shapes: dict[str, tuple[int, ...]] = {
+        "mass": (n, n), "forces": (n,), "constraints": (m,), "velocity_constraints": (k,), "kinematics": (nq,),
+        "jacobian": (m, nq), "gamma": (m + k,), "energy": (), "potential_energy": (), "power": (),
+    }  # fmt: skip
+    for what, fun in of.items():
+        if (has := np.shape(fun(t, y))) != shapes[what]:
+            raise ValueError(
+                f"mechanism: {what} has the shape {has}; expected {shapes[what]} for {nq} coordinates, {n} speeds and "
+                f"{m + k} constraints."
+            )
 
 
-def _require_symmetric(M: np.ndarray) -> None:
-    """Raise ValueError if the mass matrix M is not symmetric."""
+def _require_masses(parts: Parts, names: Names, t: float, y: np.ndarray, tolerance: float) -> None:
+    """Raise ValueError if the mass matrix M is not symmetric, or u M u / 2 < 0 for speeds that the constraints allow.
+
+    Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
+    """
+    M, _, G, _, _ = parts.matrices(names, t, y)
     wrong = np.abs(M - M.T)
     if (wrong > ROUNDING * np.abs(M).max(initial=0.0)).any():
         i, j = np.unravel_index(np.argmax(wrong), M.shape)
@@ -262,22 +233,13 @@ def _require_symmetric(M: np.ndarray) -> None:
             f"mechanism: mass must be a symmetric matrix, but at the start its entries [{i}, {j}] and [{j}, {i}] are "
             f"{M[i, j]:.6g} and {M[j, i]:.6g}. Correct one of them, or give only the diagonal of a diagonal matrix."
         )
-
-
-def _require_positive(parts: Parts, names: Names, t: float, y: np.ndarray, tolerance: float) -> None:
-    """Raise ValueError if the kinetic energy u M u / 2 is negative at the start for speeds that the constraints allow.
-
-    Directions of speeds count as allowed up to `tolerance`, the ``rank_tolerance`` of the problem.
-    """
-    M, _, G, _, _ = parts.matrices(names, t, y)
     sizes = np.linalg.norm(G, axis=1, keepdims=True)
     _, found, directions = np.linalg.svd(G / np.where(sizes > 0, sizes, 1.0))
-    allowed = directions[np.count_nonzero(found > tolerance) :].T if len(G) else np.eye(len(M))
+    allowed = directions[np.count_nonzero(found > tolerance) :].T
     energies = np.diag(allowed.T @ M @ allowed)
     # In these units the signs do not depend on those of the masses.
     allowed = allowed / np.sqrt(np.where(energies != 0, np.abs(energies), 1.0))
-    speeds = allowed @ np.linalg.eigh(allowed.T @ M @ allowed)[1]
-    for u in speeds.T:
+    for u in (allowed @ np.linalg.eigh(allowed.T @ M @ allowed)[1]).T:
         if u @ M @ u < -ROUNDING * (np.abs(u) @ np.abs(M) @ np.abs(u)):
             u = u / u[np.argmax(np.abs(u))]
             shown_speeds = ", ".join(f"{name} = {value:.3g}" for name, value in zip(names.speeds, u, strict=True))
@@ -287,47 +249,40 @@ def _require_positive(parts: Parts, names: Names, t: float, y: np.ndarray, toler
             )
 
 
-def _require_linear(given: Given, t: float, q: np.ndarray, u: np.ndarray) -> None:
-    """Raise ValueError if a function that must be linear in the speeds is not."""
-    rng = np.random.default_rng(7)
-    one, two = rng.uniform(0.5, 1.5, (2, u.size))
-    for what in ("kinematics", "velocity_constraints"):
-        fun = getattr(given, what)
-        if fun is None:
-            continue
-        rest, first, second, both = (np.asarray(fun(t, q, v), float) for v in (0 * u, one, two, one + two))
-        size = np.abs(first) + np.abs(second) + np.abs(rest)
-        wrong = np.abs(both - first - second + rest)
-        if not (wrong <= LINEAR * size.max(initial=0.0)).all():
-            k = int(np.argmax(wrong))
+def _require_linear(of: Mapping[str, Any], t: float, q: np.ndarray, n: int) -> None:
+    """Raise ValueError if a function that must be linear in the speeds is not; those in `of` take (t, y)."""
+    one, two = np.random.default_rng(7).uniform(0.5, 1.5, (2, n))
+    for what in of.keys() & {"kinematics", "velocity_constraints"}:
+        values = [np.asarray(of[what](t, np.append(q, u)), float) for u in (0 * one, one, two, one + two)]
+        wrong = np.abs(values[3] - values[1] - values[2] + values[0])
+        if not (wrong <= ROUNDING * np.abs(values).max(initial=0.0)).all():
             raise ValueError(
-                f"mechanism: {what} must be linear in the speeds, but component {k} of its value is not. Write it so "
-                "that the factors of the speeds depend on t and q only."
+                f"mechanism: {what} must be linear in the speeds, but component {np.argmax(wrong)} of its value is "
+                "not. Write it so that the factors of the speeds depend on t and q only."
             )
 
 
-def _require_derivatives(given: Given, parts: Parts, problem: MechanicsProblem, t: float) -> None:
+def _require_derivatives(
+    of: Mapping[str, Any], parts: Parts, problem: MechanicsProblem, t: float, longest: float
+) -> None:
     """Raise ValueError if a given jacobian or gamma is wrong at a state near the start that meets the constraints.
 
-    `parts` are the functions of the problem with computed derivatives.
+    The functions in `of` take (t, y). The jacobian is compared along one direction.
     """
-    names = problem.names
-    nq, n, m = len(names.coordinates), len(names.speeds), len(names.positions)
-    for time, y in states_near(
-        t, problem.y0, problem.constraints, problem.fun, nq, problem.t_span and problem.t_span[1]
-    ):
-        q, u = y[:nq], y[nq:]
-        gradient = np.empty((m + len(names.velocities), nq + n))
-        parts.gradient(time, y, gradient)
-        computed = {"jacobian": gradient[:m, :nq], "gamma": parts.matrices(names, time, y)[3]}
-        for what, fun, args in (("jacobian", given.jacobian, (time, q)), ("gamma", given.gamma, (time, q, u))):
-            if fun is None:
-                continue
-            own, right = np.asarray(fun(*args), float), computed[what]
-            if own.shape != right.shape:
-                raise ValueError(f"mechanism: {what} has the shape {own.shape}; expected {right.shape}.")
-            wrong = np.abs(own - right).max()
-            if not wrong <= 1e-6 * max(np.abs(right).max(), np.abs(u).max(), 1e-300):
+    names, values = problem.names, plain(parts.values)
+    nq, m, t_end = len(names.coordinates), len(names.positions), None if problem.t_span is None else problem.t_span[1]
+    way, found = np.random.default_rng(11).uniform(0.5, 1.5, nq), np.empty(m + len(names.velocities))
+    derivatives = {
+        "jacobian": (0.0, lambda t, y: way, slice(m), lambda value: value @ way),
+        "gamma": (1.0, lambda t, y: parts.matrices(names, t, y)[-1], slice(m, None), lambda value: value),
+    }
+    for what in of.keys() & derivatives.keys():
+        dt, direction, rows, along = derivatives[what]
+        for time, y in states_near(t, problem.y0, problem.constraints, problem.fun, nq, t_end):
+            difference(values, time, y, dt, direction(time, y), longest, found)
+            right = found[rows]
+            wrong = np.abs(along(np.asarray(of[what](time, y), float)) - right).max(initial=0.0)
+            if not wrong <= DERIVED * max(np.abs(right).max(initial=0.0), np.abs(y[nq:]).max(initial=1e-300)):
                 raise ValueError(
                     f"mechanism: {what} differs from the derivatives of the constraints by {wrong:.3g} at a state near "
                     "the start. Correct it, or omit it to have it computed."

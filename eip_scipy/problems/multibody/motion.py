@@ -12,7 +12,10 @@ import numpy as np
 from ...core.functions import compilable, compiled_like, is_jitted, jitted
 from ...engine.native import BUILD
 
-__all__ = ["Motion", "Sizes", "changed", "motion", "new_floats", "new_like", "plain", "solve", "vector"]
+__all__ = [
+    "Motion", "changed", "complex_parts", "motion", "new_floats", "new_like", "plain", "put_complex", "solve",
+    "solve_changed", "vector",
+]  # fmt: skip
 
 SOLVE = ctypes.CFUNCTYPE(
     ctypes.c_int64, ctypes.c_void_p, *[ctypes.c_int64] * 2, ctypes.c_double, *[ctypes.c_void_p] * 2
@@ -22,20 +25,6 @@ SINGULAR_MASS = (
     "the mass matrix is singular for motions that the constraints allow: some speeds have no inertia. Give their "
     "bodies a mass or an inertia, or constrain them"
 )
-
-
-class Sizes(NamedTuple):
-    """Numbers of coordinates, speeds and constraints on the speeds."""
-
-    coordinates: int
-    speeds: int
-    constraints: int
-
-    @property
-    def matrices(self) -> int:
-        """Return the total number of entries of M, F, G and gamma."""
-        n, m = self.speeds, self.constraints
-        return n * n + n + m * n + m
 
 
 class Motion(NamedTuple):
@@ -85,27 +74,45 @@ def changed(matrices, changes, n, m, tolerance, solution, found):
     return SOLVE(work.ctypes.data, n, m, tolerance, found[0].ctypes.data, found[1].ctypes.data)
 
 
+def solve_changed(solve, changed, lanes, parts_of, put):
+    """Return `solve` for numbers with derivatives in several directions, `lanes`.
+
+    ``parts_of(numbers, lane, values, slopes)`` fills two arrays with the values and their derivatives in one direction,
+    and ``put(values, slopes, lane, numbers)`` writes them.
+    """
+
+    def solved(matrices, n, m, tolerance, accelerations, multipliers):
+        values, changes = np.empty(matrices.size), np.empty(matrices.size)
+        solution, found, rank = (np.empty(n), np.empty(m)), (np.empty(n), np.empty(m)), 0
+        for lane in range(lanes):
+            parts_of(matrices, lane, values, changes)
+            if lane == 0:
+                rank = solve(values, n, m, tolerance, solution[0], solution[1])
+            changed(values, changes, n, m, tolerance, solution, found)
+            put(solution[0], found[0], lane, accelerations)
+            put(solution[1], found[1], lane, multipliers)
+        return rank
+
+    return solved
+
+
+def complex_parts(numbers, lane, values, slopes):
+    """Fill two arrays with the real parts of complex numbers and the imaginary ones, derivatives by complex steps."""
+    values[:], slopes[:] = numbers.real, numbers.imag
+
+
+def put_complex(values, slopes, lane, numbers):
+    """Write real and imaginary parts to an array of complex numbers."""
+    numbers[:] = values + 1j * slopes
+
+
+_solve_complex = solve_changed(solve, changed, 1, complex_parts, put_complex)
+
+
 def _solve_any(matrices, n, m, tolerance, accelerations, multipliers):
-    """Call `solve` for floats, or for complex numbers whose imaginary parts are derivatives (complex steps)."""
-    if matrices.dtype.kind == "f":
-        return solve(matrices, n, m, tolerance, accelerations, multipliers)
-    values = np.ascontiguousarray(matrices.real)
-    solution, found = ((np.empty(n), np.empty(m)) for _ in range(2))
-    rank = solve(values, n, m, tolerance, *solution)
-    changed(values, matrices.imag, n, m, tolerance, solution, found)
-    for out, value, change in zip((accelerations, multipliers), solution, found, strict=True):
-        out[:] = value + 1j * change
-    return rank
-
-
-def new_floats(size, like):
-    """Return a new array of floats, so that no function is compiled for complex states, which C code would misread."""
-    return np.empty(size)
-
-
-def new_like(size, like):
-    """Return a new array with the dtype of the array `like`: for complex steps, that of complex numbers."""
-    return np.empty(size, like.dtype)
+    """Call `solve` for floats, or for complex numbers."""
+    function = solve if matrices.dtype.kind == "f" else _solve_complex
+    return function(matrices, n, m, tolerance, accelerations, multipliers)
 
 
 def _solve_duals(dual: Any) -> Callable[..., int]:
@@ -118,16 +125,26 @@ def _solve_duals(dual: Any) -> Callable[..., int]:
 solve.for_duals = _solve_duals  # type: ignore[attr-defined]
 
 
+def new_floats(size, like):
+    """Return a new array of floats, so that no function is compiled for complex states, which C code would misread."""
+    return np.empty(size)
+
+
+def new_like(size, like):
+    """Return a new array with the dtype of the array `like`: for complex steps, that of complex numbers."""
+    return np.empty(size, like.dtype)
+
+
 @lru_cache(maxsize=64)
-def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
+def motion(fill: Callable[..., None], sizes: tuple[int, int, int], tolerance: float) -> Motion:
     """Return the functions of the motion that satisfies M u' + G^T lambda = F and G u' = -gamma.
 
     ``fill(t, y, out, *params)`` fills `out` with M (by rows), F, G (by rows), gamma and q', one after the other.
-    Gradients of constraints within the distance `tolerance`, each scaled to length 1, count as dependent.
+    `sizes` are the numbers of coordinates, speeds and constraints on the speeds. Gradients of constraints within the
+    distance `tolerance`, each scaled to length 1, count as dependent.
     """
-    nq, n, m = sizes
-    matrices = sizes.matrices
-    compiles = is_jitted(fill)
+    (nq, n, m), compiles = sizes, is_jitted(fill)
+    matrices = (n + m + 1) * n + m
     solve_now, new = (jitted(compilable(item)) for item in (solve, new_floats)) if compiles else (_solve_any, new_like)
 
     def solved(t, y, rates, accelerations, multipliers, *params):
@@ -150,6 +167,7 @@ def motion(fill: Callable[..., None], sizes: Sizes, tolerance: float) -> Motion:
         for k in range(n):
             out[nq + k] = accelerations[k]
 
+    rhs.not_jitted = getattr(fill, "not_jitted", "")  # type: ignore[attr-defined]
     return Motion(compiled_like(rhs, fast), fast)
 
 

@@ -1,4 +1,4 @@
-"""Functions of a mechanism: those of the user, and those that a problem is made of."""
+"""Functions that a mechanical problem is made of."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.functions import compilable, jitted, own_values
 from ...core.inputs import shown
 from .motion import plain
 from .start import Names
 
-__all__ = ["Energy", "Given", "Outputs", "Parts", "columns_of", "on_copies", "required_outputs"]
+__all__ = ["Energy", "Outputs", "Parts", "required_outputs"]
 
 
 class Outputs(NamedTuple):
@@ -22,73 +21,16 @@ class Outputs(NamedTuple):
     fill: Callable[..., None]
 
 
-def columns_of(what: str, t: Any, y: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times as an array (k,) and the states as columns (n, k); ValueError if they do not fit."""
-    times, states = np.atleast_1d(np.asarray(t, float)), np.asarray(y, float)
-    columns = states.reshape(len(states), -1)
-    if np.ndim(t) != states.ndim - 1 or columns.shape != (n, times.size):
-        raise ValueError(
-            f"{what}: y has the shape {states.shape} for {times.size} times; expected ({n},) for a number t, or a "
-            "column for each time."
-        )
-    return times, columns
-
-
 def required_outputs(what: str, outputs: Any, taken: Any) -> dict[str, Any]:
     """Return `outputs` as a dictionary; raise an error if a key is not a string, or is `taken` by a component."""
-    if outputs is None:
-        return {}
-    if not isinstance(outputs, Mapping):
+    if not isinstance(outputs, Mapping | None):
         raise TypeError(f"{what}: outputs must be a mapping of names to quantities, got {shown(outputs)}.")
-    for name in outputs:
+    for name in outputs or {}:
         if not isinstance(name, str):
             raise TypeError(f"{what}: names of outputs must be strings, got {shown(name)}.")
         if name in taken:
             raise ValueError(f"{what}: the output {name!r} has the name of a component of the state; rename it.")
-    return dict(outputs)
-
-
-class Given(NamedTuple):
-    """The functions of a mechanism, see `mechanism`; None for those that the user did not give."""
-
-    mass: Any
-    forces: Any
-    constraints: Any
-    velocity_constraints: Any
-    kinematics: Any
-    jacobian: Any
-    gamma: Any
-    energy: Any
-    potential_energy: Any
-    power: Any
-    outputs: Any = None  # a mapping
-
-    def compiled(self) -> Given:
-        """Return functions that are jitted by Numba, if those of the user are: arrays are replaced by functions."""
-        return self._mapped(lambda item: item if callable(item) else jitted(compilable(_constant(item))))
-
-    def called(self) -> Given:
-        """Return functions for calls from Python, see `on_copies`: arrays are replaced by functions, too."""
-        return self._mapped(lambda item: on_copies(item if callable(item) else _constant(item)))
-
-    def _mapped(self, change: Callable[[Any], Any]) -> Given:
-        given = {name: item for name, item in self._asdict().items() if name != "outputs" and item is not None}
-        return self._replace(**{name: change(item) for name, item in given.items()})
-
-
-def _constant(value: Any) -> Callable[..., Any]:
-    kept = np.array(value)  # which the user does not change
-    return lambda *_: kept
-
-
-def on_copies(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `fun` with copies of its arguments and of its value, if these are arrays.
-
-    A function of the user may then change its arguments, which are parts of the state, and may return the same array
-    at each call.
-    """
-    own = own_values(fun)
-    return lambda *args: own(*(item.copy() if isinstance(item, np.ndarray) else item for item in args))
+    return dict(outputs or {})
 
 
 class Energy(NamedTuple):
@@ -122,8 +64,8 @@ class Parts(NamedTuple):
 
     def matrices(self, names: Names, t: float, y: np.ndarray, args: tuple[Any, ...] = ()) -> list[np.ndarray]:
         """Return M, F, G, gamma and q' at a state, computed by functions that are not compiled."""
-        n, m = len(names.speeds), len(names.velocities)
-        out = np.empty(names.sizes.matrices + len(names.coordinates))
+        nq, n, m = names.sizes
+        out = np.empty((n + m + 1) * n + m + nq)
         plain(self.fill)(t, y, out, *args)
         M, F, G, gamma, rates = np.split(out, np.cumsum([n * n, n, m * n, m]))
         return [M.reshape(n, n), F, G.reshape(m, n), gamma, rates]

@@ -14,7 +14,6 @@ from ...core.invariants import Invariant, with_args
 from ...core.names import nearest
 from ...core.project import project
 from ...engine.trust import ProjectionWarning
-from .motion import Sizes
 
 __all__ = ["MET", "Names", "by_name", "name_of", "nearest_start", "started"]
 
@@ -41,9 +40,9 @@ class Names(NamedTuple):
         return (*self.coordinates, *self.speeds)
 
     @property
-    def sizes(self) -> Sizes:
+    def sizes(self) -> tuple[int, int, int]:
         """Return the numbers of coordinates, speeds and constraints on velocities."""
-        return Sizes(len(self.coordinates), len(self.speeds), len(self.velocities))
+        return len(self.coordinates), len(self.speeds), len(self.velocities)
 
 
 def name_of(key: Any) -> str:
@@ -67,54 +66,46 @@ def by_name(what: str, given: Mapping[Any, Any], named: Callable[[Any], str] = n
 
 
 def started(
-    what: str,
-    names: Names,
-    constraints: Sequence[Invariant],
-    q0: Any,
-    u0: Any,
-    params: np.ndarray | None,
-    t: float,
-    independent: Iterable[str] | None,
-) -> tuple[np.ndarray, tuple[str, ...]]:
+    what: str, names: Names, constraints: Sequence[Invariant], q0: Any, u0: Any, params: np.ndarray | None, t: float,
+    independent: Iterable[Any] | None,
+) -> tuple[np.ndarray, tuple[str, ...]]:  # fmt: skip
     """Return a state that meets the constraints, and notes on computed components; see `MechanicsProblem.start`.
 
     `constraints` is empty, or contains one `Invariant` for all constraints. `what` names the problem in messages.
     """
     held = _independent(names, independent)
-    y = np.concatenate(
-        [
-            _numbers("q0", q0, names.coordinates, held),
-            _numbers("u0", u0, names.speeds, held),
-        ]
-    )
+    y = np.append(_numbers("q0", q0, names.coordinates, held), _numbers("u0", u0, names.speeds, held))
     if not constraints:
         return y, ()
-    (item,) = constraints
-    if params is not None:
-        item = with_args(item, (params,))
+    item = constraints[0] if params is None else with_args(constraints[0], (params,))
     sigma = np.array([0.0 if name in held else 1.0 for name in names.state])
     found = nearest_start(y, item, t, sigma) if sigma.any() else y
-    if sigma.any() and not _violation(found, item, t)[2] <= MET:
-        found = _downhill(y, item, t, sigma)
+    if sigma.any() and not _shares(found, item, t).max() <= MET:
+        # The state with the smallest sum of squares of the residuals may be nearer to a solution.
+        free = np.eye(y.size)[:, sigma > 0]
+        lowest = least_squares(
+            lambda x: item.fun(t, y + free @ x), np.zeros(free.shape[1]),
+            lambda x: _gradient(item, t, y + free @ x) @ free, x_scale="jac",
+        )  # fmt: skip
+        found = nearest_start(y + free @ lowest.x, item, t, sigma)
     _require_met(what, found, item, t, sigma)
     moved = [
         f"{name} {before:.6g} to {after:.6g}"
         for name, before, after in zip(names.state, y, found, strict=True)
         if abs(after - before) > SEEN * max(abs(before), abs(after))
     ]
-    notes = (f"the start was solved for, from guesses: {', '.join(moved)}",) if moved else ()
-    return found, notes
+    return found, (f"the start was solved for, from guesses: {', '.join(moved)}",) if moved else ()
 
 
-def _independent(names: Names, independent: Iterable[str] | None) -> set[str]:
+def _independent(names: Names, independent: Iterable[Any] | None) -> set[str]:
     """Return the names of the components whose given values are kept: all components if `independent` is None."""
     if independent is None:
         return set(names.state)
     found = {name_of(name) for name in ([independent] if isinstance(independent, str) else independent)}
     for name in sorted(found - set(names.state)):
-        hint = nearest(name, names.state)
         raise ValueError(
-            f"independent: {name!r} is not a component of the state{hint}; expected names of {', '.join(names.state)}."
+            f"independent: {name!r} is not a component of the state{nearest(name, names.state)}; expected names of "
+            f"{', '.join(names.state)}."
         )
     return found
 
@@ -126,15 +117,14 @@ def _numbers(what: str, given: Any, names: Sequence[str], held: set[str]) -> np.
     """
     if isinstance(given, Mapping):
         found = by_name(what, given)
-        for name in found:
-            if name not in names:
-                raise ValueError(f"{what}: unknown name {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
-        missing = [name for name in names if name in held and name not in found]
-        if missing:
-            raise ValueError(
-                f"{what}: {missing[0]} is missing; give its value, or list in independent= the components whose values "
-                "are kept, so that the others are computed."
-            )
+        for name in found.keys() - set(names):
+            raise ValueError(f"{what}: unknown name {name!r}{nearest(name, names)}; expected {', '.join(names)}.")
+        for name in names:
+            if name in held and name not in found:
+                raise ValueError(
+                    f"{what}: {name} is missing; give its value, or list in independent= the components whose values "
+                    "are kept, so that the others are computed."
+                )
         given = [found.get(name, 0.0) for name in names]
     values = np.atleast_1d(real_array(what, given)).astype(float)
     if values.shape != (len(names),):
@@ -149,25 +139,10 @@ def nearest_start(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ProjectionWarning)  # the remaining residuals are examined by `_violation`
+            warnings.simplefilter("ignore", ProjectionWarning)  # callers examine the remaining residuals
             return project(y, item, t=t, sigma=sigma, iterations=NEWTON_STEPS).y
     except ValueError:
         return y
-
-
-def _downhill(y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> np.ndarray:
-    """Return what `nearest_start` finds from the state near `y` with the smallest sum of squares of the residuals."""
-    free = sigma > 0
-
-    def whole(x: np.ndarray) -> np.ndarray:
-        state = y.copy()
-        state[free] = x
-        return state
-
-    found = least_squares(
-        lambda x: item.fun(t, whole(x)), y[free], lambda x: _gradient(item, t, whole(x))[:, free], x_scale="jac"
-    )
-    return nearest_start(whole(found.x), item, t, sigma)
 
 
 def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
@@ -177,47 +152,38 @@ def _gradient(item: Invariant, t: float, y: np.ndarray) -> np.ndarray:
     return out
 
 
-def _violation(y: np.ndarray, item: Invariant, t: float) -> tuple[int, float, float]:
-    """Return the index of the constraint that is violated most, its value, and the violation relative to its size."""
-    values = np.asarray(item.fun(t, y), float)
+def _shares(y: np.ndarray, item: Invariant, t: float) -> np.ndarray:
+    """Return the residuals of all constraints relative to the size of their terms."""
     gradient = np.abs(_gradient(item, t, y))
-    # The size of a constraint is that of its terms, or its change while a component changes by 1.
+    # A constraint whose terms are small has the size of its change while a component changes by 1.
     size = np.maximum(gradient @ np.abs(y), gradient.max(axis=1))
-    share = np.abs(values) / np.where(size > 0, size, 1.0)
-    worst = int(np.argmax(share))
-    return worst, float(values[worst]), float(share[worst])
+    return np.abs(item.fun(t, y)) / np.where(size > 0, size, 1.0)
 
 
 def _require_met(what: str, y: np.ndarray, item: Invariant, t: float, sigma: np.ndarray) -> None:
     """Raise ValueError if a constraint is violated by more than `MET` times its size; `sigma` is 0 for kept ones."""
-    worst, residual, share = _violation(y, item, t)
-    if share <= MET:
+    shares, values, gradient = _shares(y, item, t), item.fun(t, y), _gradient(item, t, y)[:, sigma > 0]
+    if shares.max() <= MET:
         return
-    name = item.value_names[worst]
+    worst = int(np.argmax(shares))
+    violated = f"the constraint {item.value_names[worst]!r}: it is {values[worst]:.3g}, expected 0."
     if not sigma.any():
         raise ValueError(
-            f"{what}: the start violates the constraint {name!r}: it is {residual:.3g}, expected 0. List "
-            "in independent= the components whose values are to be kept; the others are then computed."
+            f"{what}: the start violates {violated} List in independent= the components whose values are to be kept; "
+            "the others are then computed."
+        )
+    sizes = np.linalg.norm(gradient, axis=1)
+    found = np.linalg.svd(gradient[sizes > 0] / sizes[sizes > 0, None], compute_uv=False)
+    left, why = np.abs(values) / np.where(sizes > 0, sizes, np.inf), ""
+    others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
+    if sizes[worst] <= DEPENDENT * sizes.max():
+        why = "It does not depend on any component that is computed. "
+    elif others and np.count_nonzero(found > DEPENDENT * found.max()) < np.count_nonzero(sizes):
+        why = (
+            f"It contradicts {', '.join(others)}, because the gradients of these constraints depend on each other "
+            "at the end of the search. If no start can meet all of them, remove one. "
         )
     raise ValueError(
-        f"{what}: no start was found that meets the constraint {name!r}: it is {residual:.3g}, expected 0. "
-        f"{_why_not(item, item.fun(t, y), _gradient(item, t, y)[:, sigma > 0], worst)}"
+        f"{what}: no start was found that meets {violated} {why}List fewer components in independent=, or give a guess "
+        "that is nearer to a solution."
     )
-
-
-def _why_not(item: Invariant, values: np.ndarray, gradient: np.ndarray, worst: int) -> str:
-    """Return why the constraint `worst` is not met, and what to do; `gradient` has the derivatives that could help."""
-    sizes = np.linalg.norm(gradient, axis=1)
-    if sizes[worst] <= DEPENDENT * sizes.max():
-        return "It does not depend on any component that is computed; list fewer components in independent=."
-    unit = gradient[sizes > 0] / sizes[sizes > 0, None]
-    found = np.linalg.svd(unit, compute_uv=False)
-    left = np.abs(values) / np.where(sizes > 0, sizes, np.inf)
-    others = [repr(item.value_names[k]) for k in np.flatnonzero(left > SEEN * left[worst]) if k != worst]
-    if others and (found > DEPENDENT * found.max()).sum() < len(unit):
-        return (
-            f"It contradicts {', '.join(others)}, because the gradients of these constraints depend on each other "
-            "at the end of the search. Remove one of them, list fewer components in independent=, or give a guess that "
-            "is nearer to a solution."
-        )
-    return "List fewer components in independent=, or give a guess that is nearer to a solution."
