@@ -297,7 +297,7 @@ def encoded(name: str, value: Any, arrays: dict[str, np.ndarray]) -> Any:
     A mapping with one key stands for everything that JSON does not have; its key names the kind. TypeError is raised
     for a field that would not come back as it is.
     """
-    if isinstance(value, np.generic):
+    if isinstance(value, np.generic) and value.dtype.kind not in "mM":  # a date would become an integer
         value = value.item()
     if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
         return value

@@ -151,16 +151,15 @@ def _reached(blocks: dict[int, Any], label: int) -> set[int]:
 
 
 def _replaced(function: Any, block: Any, calls: list[Any]) -> Iterator[Any]:
-    """Yield the statements of a block in which `calls` are replaced, and nothing is returned."""
+    """Yield the statements of a block in which `calls` are replaced.
+
+    The array is still returned: without a use of it Numba would leave out all that is written to it.
+    """
     of_lists = [call for call in calls if _value(function, call.func) is np.array]
     lists = [guard(get_definition, function, call.args[0]) for call in of_lists]
     for statement in block.body:
         loc, value = statement.loc, getattr(statement, "value", None)
-        if isinstance(statement, ir.Return):
-            nothing = _assigned(block.scope, ir.Const(None, loc))
-            result = _assigned(block.scope, ir.Expr.cast(nothing.target, loc))
-            yield from (nothing, result, ir.Return(result.target, loc))
-        elif isinstance(value, ir.Expr) and any(value is known for known in calls):
+        if isinstance(value, ir.Expr) and any(value is known for known in calls):
             yield from _in_place(function, statement)
         elif isinstance(value, ir.Expr) and any(value is known for known in lists):
             yield ir.Assign(ir.Const(None, loc), statement.target, loc)

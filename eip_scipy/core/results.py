@@ -50,13 +50,13 @@ class Diagnostics:
         """Sentences on what the run found by itself, and on invariants of particles that are missing.
 
         The number of linear invariants that were found and are kept; the invariants whose gradients need no evaluation
-        of their own, because f has their components; and whether the run has refuted this since.
+        of their own, because f has their components; and whether the run has found that they do not hold any longer.
         """
         found = list(self._remarks)
         if self._found_rows is not None and not self._found_rows.any():
             found.append("a linear invariant that was found at the start does not hold later: none is kept since then")
         if self._from_f:
-            until = "" if self._counters[data.FROM_F] else "; a projection has refuted this, and it is computed since"
+            until = "" if self._counters[data.FROM_F] else ", until a projection missed; it is computed since then"
             found.append(f"the gradient of {self._from_f} is made of the components of f{until}")
         return tuple(found)
 

@@ -51,6 +51,8 @@ NEW = [
     "out = np.zeros_like(y)\nif {} > 0.1:\n    out[0] = {}\nelse:\n    out[3] = {}\nout[1] = {}\nreturn out",
     "if {} > 0.2:\n    return np.array([y[0], {}, 0.0, 1.0])\nreturn np.array([{}, y[3], 2.0, {}])",
     "out = np.zeros((4,))\nfor i in range(0, 4, 3):\n    out[i] = i * {} - {}\nout[2] = {} + {}\nreturn out",
+    "scale = lambda a: 2 * a\nout = np.zeros(4)\nout[0] = scale({})\nout[1] = {} + {}\nout[3] = scale({})\nreturn out",
+    "most = max([abs(a) for a in y])\nout = np.empty(4)\nout[:] = most\nout[1] = {} + {}\nout[2] -= {}\nreturn out",
 ]
 STAYS = [
     "return y * {} + {} + {} * {}",

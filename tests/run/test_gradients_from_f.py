@@ -18,7 +18,7 @@ MASSES = RNG.uniform(0.5, 3.0, N)
 CHARGES = np.where(np.arange(N) % 2, -1.0, 1.0) * RNG.uniform(0.5, 1.5, N)
 Q0, V0 = 0.4 * RNG.standard_normal(N), 0.4 * RNG.standard_normal(N)
 FROM_F = "is made of the components of f"
-REFUTED = "a projection has refuted this"
+REFUTED = "until a projection missed"
 
 # Potentials of a chain with fixed ends, as functions of (t, q), and their slopes by hand.
 PAIRS = {

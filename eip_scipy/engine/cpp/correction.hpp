@@ -501,8 +501,8 @@ inline Code stay(const AnyRun &run, const Step &step) {
 template <class AnyRun>
 inline Code project_evaluated(const AnyRun &run, const Step &step);
 
-// Return whether the last projection left more of a residual than it would with a gradient that is right: of a gradient from
-// f that holds no longer, as with drag or a wall.
+// Return whether the last projection left more of a residual than it would with a gradient that is right: one from f may
+// hold no longer, as with drag or a wall.
 template <class AnyRun>
 inline bool refutes(const AnyRun &run) {
     const auto &w = run.work;

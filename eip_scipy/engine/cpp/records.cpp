@@ -504,7 +504,8 @@ OctetSystem octet_system_of(nb::handle functions, const Data &run) {
     const Multistep *ms = run.method.multistep;
     const bool steps =
         ms ? !ms->brief && !ms->level && (ms->count == 0 || !jacobian.is_none()) : !o.compensated && o.every >= 1;
-    require(!run.system.python && w.n == w.m && o.pairs == 0 && !o.adaptive && o.iterations == 1 && o.direction == NEW && steps,
+    const bool plain = w.n == w.m && o.pairs == 0 && !o.adaptive && o.iterations == 1 && o.direction == NEW;
+    require(!run.system.python && plain && steps,
             "engine: members with these options cannot be run in batches of eight");
     return system;
 }

@@ -238,18 +238,19 @@ inline void note_slowness(double rate, double terms, int64_t b, const Work &w) {
     }
 }
 
-// What the invariants whose gradients are made from f change by along the flow, into w.flow with the other sign: differences of
-// their values. The product of such a gradient with f tells nothing: it is 0 in each state.
+// The rates along the flow of the invariants whose gradients are made from f, into w.flow with the other sign: differences
+// of their values. The product of such a gradient with f tells nothing: it is 0 in each state.
 [[gnu::cold, gnu::noinline]] inline void note_values_along_flow(const Run &run, const Step &step, const FromF &known) {
     const Work &w = run.work;
     const double part = PART_OF_STEP * step.h;
     double *state = w.stage, *values = w.inner_mu;
     fill(w.flow, 0.0, w.l);
-    for (const auto &[shifts, weight] : {std::pair{1.0, 2.0 / 3.0}, {-1.0, -2.0 / 3.0}, {2.0, -1.0 / 12.0}, {-2.0, 1.0 / 12.0}}) {
+    for (const int shifts : {1, -1, 2, -2}) {
         for (int64_t j = 0; j < w.m; ++j) state[j] = w.y_hat[j] + shifts * part * w.last()[j];
         run.system.inv(w, step.t_new, state, values);
+        const double weight = (shifts > 0 ? 1.0 : -1.0) * ORDER_4[std::abs(shifts) - 1] / part;
         for (int64_t i = 0; i < w.l; ++i)
-            if (known.has(i)) w.flow[i] -= weight / part * values[i];
+            if (known.has(i)) w.flow[i] -= weight * values[i];
     }
 }
 
