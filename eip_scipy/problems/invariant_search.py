@@ -300,11 +300,11 @@ class _Search:
         return len(set(self.items[k])) if k < len(self.monomials) else 0
 
     def _simplicity(self, row: Array) -> tuple[Any, ...]:
-        """Return the key that sorts rows by simplicity; both signs count as simple, as in angular momenta."""
+        """Return the key that sorts rows: fewest terms; two with both signs, as of momenta; squares, as in energies."""
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE * np.abs(row).max()).tolist()
         negative = np.count_nonzero(row[support] < 0)
         mixed = sum(self._mixed(k) > 1 for k in support)
-        return len(support), -min(negative, len(support) - negative), mixed, support
+        return len(support), mixed * (len(support) > 2), -min(negative, len(support) - negative), mixed, support
 
     def _null_space(self, columns: Array) -> Array:
         """Return orthonormal combinations of some items whose rates are 0 up to rounding."""
