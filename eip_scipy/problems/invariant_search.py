@@ -11,7 +11,7 @@ from itertools import combinations_with_replacement
 from typing import Any, cast
 
 import numpy as np
-from scipy.integrate import RK45
+from scipy.integrate import RK23
 
 from ..core.conserved import reduced_rows
 from ..core.derivatives import difference_gradient, unless_error
@@ -37,9 +37,9 @@ FRESH, SOME, TRAJECTORIES, STEPS = 60, 10, 6, 20
 # Errors of a correct gradient of a term, relative to its largest component and in roundings of the term.
 GRADIENT_ERROR, GRADIENT_ROUNDINGS = 1e-6, 1e4
 ROUND_OFF = 1e-3  # bound of a rate relative to the sum of its products, in units of rtol
-COMPLEX_STEP = 1e-100
+COMPLEX_STEP, TINY = 1e-100, np.finfo(float).tiny
 LEAST_PIVOT, NEGLIGIBLE, INDEPENDENT = 1e-3, 1e-6, 1e-6
-LARGEST_DENOMINATOR, LARGEST_INTEGER, RATIONAL, LONGEST_NAME = 64, 1000, 1e-8, 200
+LARGEST_DENOMINATOR, LARGEST_INTEGER, LONGEST_NAME = 64, 1000, 200
 
 
 def find_invariants(
@@ -216,8 +216,7 @@ class _Domain:
     def trajectory(self, y: Array) -> list[Point]:
         """Return points on the trajectory from a state at `t`, within the time 5 `tau`."""
         found: list[Point] = []
-        end, atol = self.t + 5 * self.tau, 1e-6 * self.scale
-        solver = RK45(self.slope, self.t, y, end, max_step=self.tau, rtol=1e-3, atol=atol)
+        solver = RK23(self.slope, self.t, y, self.t + 5 * self.tau, max_step=self.tau, rtol=1e-2)
         while solver.status == "running" and len(found) < STEPS:
             found += self._point(solver.t, solver.y.copy())
             solver.step()
@@ -255,6 +254,7 @@ class _Search:
         self.n, self.rtol, s = domain.y0.size, rtol, domain.scale
         self.monomials = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(self.n), d)]
         self.items: list[Item] = [*self.monomials, *((self.n + k,) for k in range(len(domain.terms)))]
+        self.variables = np.array([len(set(c)) for c in self.monomials] + [0] * len(domain.terms))
         fit = len(self.items) + len(self.items) // 4 + 30
         points = domain.points(fit + FRESH)
         for term in domain.terms:
@@ -263,7 +263,7 @@ class _Search:
             points += domain.trajectory(y)
         states, derivatives = map(np.array, zip(*points, strict=True))
         slopes, z, gradients = derivatives[:, 0] / s, states / s, derivatives[:, 1:] * s
-        slopes /= np.maximum(np.abs(slopes).sum(axis=1, keepdims=True), np.finfo(float).tiny)
+        slopes /= np.maximum(np.abs(slopes).sum(axis=1, keepdims=True), TINY)
         rates, sizes = self._along(slopes, z, gradients), self._along(*map(np.abs, (slopes, z, gradients)))
         weights = np.sqrt(np.mean(sizes[:, :fit] ** 2, axis=1, keepdims=True))
         weights[weights == 0] = 1.0
@@ -286,7 +286,7 @@ class _Search:
         """Return independent invariants: coefficients of monomials of y and of terms."""
         accepted: list[Array] = []
         # Products of several variables are eliminated first: what is left are squares, as in an energy.
-        order = sorted(range(len(self.items)), key=lambda k: (-self._mixed(k), -len(self.items[k]), k))
+        order = sorted(range(len(self.items)), key=lambda k: (-self.variables[k], -len(self.items[k]), k))
         for width in sorted({len(self.monomials), len(self.items)}):
             null = self._null_space(np.arange(width))
             for row in sorted(reduced_rows(null[:, order], LEAST_PIVOT)[:, np.argsort(order)], key=self._simplicity):
@@ -295,15 +295,11 @@ class _Search:
                     accepted.append(simple)
         return [{item: float(c) for item, c in zip(self.items, row / self.units, strict=True) if c} for row in accepted]
 
-    def _mixed(self, k: int) -> int:
-        """Return the number of variables of a monomial, and 0 for a term."""
-        return len(set(self.items[k])) if k < len(self.monomials) else 0
-
     def _simplicity(self, row: Array) -> tuple[Any, ...]:
         """Return the key that sorts rows: fewest terms; two with both signs, as of momenta; squares, as in energies."""
         support = np.flatnonzero(np.abs(row) > NEGLIGIBLE * np.abs(row).max()).tolist()
         negative = np.count_nonzero(row[support] < 0)
-        mixed = sum(self._mixed(k) > 1 for k in support)
+        mixed = np.count_nonzero(self.variables[support] > 1)
         return len(support), mixed * (len(support) > 2), -min(negative, len(support) - negative), mixed, support
 
     def _null_space(self, columns: Array) -> Array:
@@ -321,9 +317,8 @@ class _Search:
     def _is_new(self, row: Array, accepted: Sequence[Array]) -> bool:
         """Return True if a candidate's gradient is independent of those of the accepted invariants at some point."""
         rows = np.array([*accepted, row])
-        gradients = np.einsum("rk,ikm->mri", rows, self.partials)
         sizes = np.einsum("rk,ikm->mr", np.abs(rows), np.abs(self.partials))  # all terms of a constant cancel
-        gradients /= np.maximum(sizes, np.finfo(float).tiny)[..., None]
+        gradients = np.einsum("rk,ikm->mri", rows, self.partials) / np.maximum(sizes, TINY)[..., None]
         return len(rows) in np.linalg.matrix_rank(gradients, tol=INDEPENDENT)
 
     def _simplified(self, row: Array) -> Array:
@@ -337,9 +332,8 @@ class _Search:
         near = [Fraction(value).limit_denominator(LARGEST_DENOMINATOR) for value in nearest.tolist()]
         common = math.lcm(*(value.denominator for value in near))
         common = common if max(map(abs, near)) * common <= LARGEST_INTEGER else 1
-        simple = np.array([float(value * common) for value in near])
-        is_near = np.allclose(simple, common * nearest, rtol=RATIONAL, atol=0.0)
-        return self.units * (simple if is_near and self._is_kept(simple * self.units) else nearest)
+        simple = self.units * [float(value * common) for value in near]
+        return simple if self._is_kept(simple) else nearest * self.units
 
 
 def _invariant(parts: dict[Item, float], terms: Sequence[Term], names: Sequence[str], like: Any) -> Invariant:
