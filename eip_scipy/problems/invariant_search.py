@@ -33,12 +33,13 @@ LARGEST_BASIS = 2000  # the factorisation takes some ten seconds
 # drives a system may be much slower than its motion. Times at which a system that is at rest at `t` may move.
 NEAREST, LATEST, LATER = 1e-4, 1000.0, (10.0 ** np.arange(-9, 19)).tolist()
 # Numbers of points that test a candidate, of those at which gradients are compared, of trajectories and their steps.
-FRESH, SOME, TRAJECTORIES, STEPS = 60, 10, 6, 20
+FRESH, SOME, TRAJECTORIES, STEPS = 60, 8, 6, 20
 # Errors of a correct gradient of a term, relative to its largest component and in roundings of the term.
 GRADIENT_ERROR, GRADIENT_ROUNDINGS = 1e-6, 1e4
 ROUND_OFF = 1e-3  # bound of a rate relative to the sum of its products, in units of rtol
 COMPLEX_STEP, TINY = 1e-100, np.finfo(float).tiny
-LEAST_PIVOT, NEGLIGIBLE, INDEPENDENT = 1e-3, 1e-6, 1e-6
+LEAST_PIVOT, INDEPENDENT = 1e-3, 1e-6
+NEGLIGIBLE = 1e-6, 1e-9  # coefficients that are left out, if what is left is conserved
 LARGEST_DENOMINATOR, LARGEST_INTEGER, LONGEST_NAME = 64, 1000, 200
 
 
@@ -83,7 +84,7 @@ def find_invariants(
     Returns
     -------
     list of Invariant
-        Functionally independent invariants, the simplest first, with readable names (``"y0*y3 - y1*y2"``) and
+        Functionally independent invariants, simple ones first, with readable names (``"y0*y3 - y1*y2"``) and
         gradients. Coefficients are small fractions if the combination with these is conserved too. The functions are
         jitted if `fun` and the `terms` that they contain are jitted, and can otherwise be pickled if these terms can.
 
@@ -246,15 +247,15 @@ class _Search:
 
     A candidate is a row of coefficients of `items`, first monomials of z = y / scale and then terms, each in units of
     the size of its rate. `matrix` has their rates at the points that determine candidates, `rates` those at the points
-    that test them, `sizes` the sums of the absolute values of the products in `rates`, and `partials` (n, k, m) the
+    that test them, `sizes` the sums of the absolute values of the products in `rates`, and `partials` (k, n, m) the
     derivatives of the items by z at some of these points.
     """
 
     def __init__(self, domain: _Domain, degree: int, rtol: float) -> None:
-        self.n, self.rtol, s = domain.y0.size, rtol, domain.scale
+        self.n, self.terms, self.rtol, s = domain.y0.size, len(domain.terms), rtol, domain.scale
         self.monomials = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(self.n), d)]
-        self.items: list[Item] = [*self.monomials, *((self.n + k,) for k in range(len(domain.terms)))]
-        self.variables = np.array([len(set(c)) for c in self.monomials] + [0] * len(domain.terms))
+        self.items: list[Item] = [*self.monomials, *((self.n + k,) for k in range(self.terms))]
+        self.variables = np.array([len(set(c)) for c in self.monomials] + [0] * self.terms)
         fit = len(self.items) + len(self.items) // 4 + 30
         points = domain.points(fit + FRESH)
         for term in domain.terms:
@@ -269,9 +270,13 @@ class _Search:
         weights[weights == 0] = 1.0
         rates, sizes, some = rates / weights, sizes / weights, slice(fit, fit + SOME)
         self.matrix, self.rates, self.sizes = rates[:, :fit].T, rates[:, fit:], sizes[:, fit:]
-        units = np.eye(self.n)[:, None]
-        self.partials = np.array([self._along(unit, z[some], gradients[some]) / weights for unit in units])
-        s = np.append(s, np.ones(len(domain.terms)))
+        along = (
+            np.repeat(np.eye(self.n), SOME, axis=0),
+            np.tile(z[some], (self.n, 1)),
+            np.tile(gradients[some], (self.n, 1, 1)),
+        )
+        self.partials = (self._along(*along) / weights).reshape(-1, self.n, SOME)
+        s = np.append(s, np.ones(self.terms))
         self.units = weights[:, 0] * [np.prod(s[list(item)]) for item in self.items]
 
     def _along(self, slopes: Array, z: Array, gradients: Array) -> Array:
@@ -287,8 +292,9 @@ class _Search:
         accepted: list[Array] = []
         # Products of several variables are eliminated first: what is left are squares, as in an energy.
         order = sorted(range(len(self.items)), key=lambda k: (-self.variables[k], -len(self.items[k]), k))
-        for width in sorted({len(self.monomials), len(self.items)}):
-            null = self._null_space(np.arange(width))
+        lengths = np.array([len(item) for item in self.monomials] + [len(self.monomials[-1]) + 1] * self.terms)
+        for d in range(1, lengths[-1] + 1):
+            null = self._null_space(np.flatnonzero(lengths <= d))
             for row in sorted(reduced_rows(null[:, order], LEAST_PIVOT)[:, np.argsort(order)], key=self._simplicity):
                 simple = self._simplified(row)
                 if self._is_kept(simple) and self._is_new(simple, accepted):
@@ -297,7 +303,7 @@ class _Search:
 
     def _simplicity(self, row: Array) -> tuple[Any, ...]:
         """Return the key that sorts rows: fewest terms; two with both signs, as of momenta; squares, as in energies."""
-        support = np.flatnonzero(np.abs(row) > NEGLIGIBLE * np.abs(row).max()).tolist()
+        support = np.flatnonzero(np.abs(row) > NEGLIGIBLE[0] * np.abs(row).max()).tolist()
         negative = np.count_nonzero(row[support] < 0)
         mixed = np.count_nonzero(self.variables[support] > 1)
         return len(support), mixed * (len(support) > 2), -min(negative, len(support) - negative), mixed, support
@@ -317,13 +323,16 @@ class _Search:
     def _is_new(self, row: Array, accepted: Sequence[Array]) -> bool:
         """Return True if a candidate's gradient is independent of those of the accepted invariants at some point."""
         rows = np.array([*accepted, row])
-        sizes = np.einsum("rk,ikm->mr", np.abs(rows), np.abs(self.partials))  # all terms of a constant cancel
-        gradients = np.einsum("rk,ikm->mri", rows, self.partials) / np.maximum(sizes, TINY)[..., None]
+        sizes = np.einsum("rk,kim->mr", np.abs(rows), np.abs(self.partials))  # all terms of a constant cancel
+        gradients = np.einsum("rk,kim->mri", rows, self.partials) / np.maximum(sizes, TINY)[..., None]
         return len(rows) in np.linalg.matrix_rank(gradients, tol=INDEPENDENT)
 
     def _simplified(self, row: Array) -> Array:
         """Return the nearest conserved row without negligible coefficients, with simple fractions if possible."""
-        null = self._null_space(np.flatnonzero(np.abs(row) > NEGLIGIBLE * np.abs(row).max()))
+        for bound in NEGLIGIBLE:
+            null = self._null_space(np.flatnonzero(np.abs(row) > bound * np.abs(row).max()))
+            if len(null):
+                break
         nearest = row @ null.T @ null / self.units
         if not nearest.any():
             return nearest
