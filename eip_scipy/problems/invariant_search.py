@@ -268,14 +268,11 @@ class _Search:
         rates, sizes = self._along(slopes, z, gradients), self._along(*map(np.abs, (slopes, z, gradients)))
         weights = np.sqrt(np.mean(sizes[:, :fit] ** 2, axis=1, keepdims=True))
         weights[weights == 0] = 1.0
-        rates, sizes, some = rates / weights, sizes / weights, slice(fit, fit + SOME)
+        rates, sizes = rates / weights, sizes / weights
         self.matrix, self.rates, self.sizes = rates[:, :fit].T, rates[:, fit:], sizes[:, fit:]
-        along = (
-            np.repeat(np.eye(self.n), SOME, axis=0),
-            np.tile(z[some], (self.n, 1)),
-            np.tile(gradients[some], (self.n, 1, 1)),
-        )
-        self.partials = (self._along(*along) / weights).reshape(-1, self.n, SOME)
+        some = np.tile(np.arange(fit, fit + SOME), self.n)
+        partials = self._along(np.repeat(np.eye(self.n), SOME, axis=0), z[some], gradients[some])
+        self.partials = (partials / weights).reshape(-1, self.n, SOME)
         s = np.append(s, np.ones(self.terms))
         self.units = weights[:, 0] * [np.prod(s[list(item)]) for item in self.items]
 
@@ -317,7 +314,7 @@ class _Search:
         return rows
 
     def _is_kept(self, row: Array) -> bool:
-        """Return True if the rate of a candidate is 0 up to rounding at points that did not determine it."""
+        """Return True if the rate of a candidate is 0 up to rounding at the points that did not determine it."""
         return bool((np.abs(row @ self.rates) <= ROUND_OFF * self.rtol * (np.abs(row) @ self.sizes)).all())
 
     def _is_new(self, row: Array, accepted: Sequence[Array]) -> bool:
