@@ -38,7 +38,7 @@ def cosine_gradient(y):
 
 def log(k, n=2, factor=1.0):
     """The logarithm of a component, with its gradient times a factor."""
-    return lambda y: np.log(y[k]), lambda y: factor * np.eye(n)[k] / y[k]
+    return lambda y, k=k: np.log(y[k]), lambda y, k=k: factor * np.eye(n)[k] / y[k]
 
 
 def sir(beta=2.0, gamma=0.5):
@@ -121,9 +121,8 @@ TABLE = {
          "+ 8*y1**3 + 4*y1*y2**2 - y0**4 - 4*y0**2*y1**2"]),
     "Toda, three particles": (lambda t, y: np.append(y[:3] * (np.roll(y[3:], -1) - y[3:]),
                                                      2 * (y[:3] ** 2 - np.roll(y[:3], 1) ** 2)),
-        [0.5, 0.6, 0.4, 0.3, -0.2, 0.1], {"degree": 3}, ["y3 + y4 + y5",
-        "2*y0**2 + 2*y1**2 + 2*y2**2 + y3**2 + y4**2 + y5**2", "y0*y1*y2", "3*y0**2*y3 + 3*y0**2*y4 + 3*y1**2*y4 "
-        "+ 3*y1**2*y5 + 3*y2**2*y3 + 3*y2**2*y5 + y3**3 + y4**3 + y5**3"]),
+        SPINNING, {"degree": 3}, ["y3 + y4 + y5", "2*y0**2 + 2*y1**2 + 2*y2**2 + y3**2 + y4**2 + y5**2", "y0*y1*y2",
+        "3*y0**2*y3 + 3*y0**2*y4 + 3*y1**2*y4 + 3*y1**2*y5 + 3*y2**2*y3 + 3*y2**2*y5 + y3**3 + y4**3 + y5**3"]),
     "Maxwell and Bloch": (lambda t, y: np.array([y[1], y[0] * y[2], -y[0] * y[1]]), [0.3, 0.5, 0.2], {},
                           ["2*y2 + y0**2", "y1**2 + y2**2"]),
     "Nose and Hoover": (lambda t, y: np.array([y[1], -y[0] - y[2] * y[1], y[1] ** 2 - 1, y[2] * y[3]]),
@@ -139,6 +138,7 @@ TABLE = {
                              ["y0 + y1 + y2", "5*y2 + log S"]),
     "SIR, a million": (sir(0.5e-6, 0.1), [0.99e6, 0.01e6, 0.0], {"degree": 1, "terms": {"log S": log(0, 3)}},
                        ["y0 + y1 + y2", "y2 + 200000*log S"]),
+    "SIR, slow recovery": (sir(2.0, 1e-8), [0.99, 0.01, 0.5], {"degree": 1}, ["y0 + y1 + y2"]),
     "terms of no use": (forced(lambda t, q: -q), [1e-3, 1.0], {"terms": NO_USE}, [CIRCLE]),
     "breathing trap": (forced(lambda t, q: -(1 + 0.3 * np.cos(t)) * q), [1.0, 0.0, 0.0, 1.0], {"degree": 4}, [L]),
     "at rest": (forced(lambda t, q: -q), [0.0, 0.0], {}, [CIRCLE]),
