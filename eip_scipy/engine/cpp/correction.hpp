@@ -508,7 +508,8 @@ inline bool refutes(const AnyRun &run) {
     const auto &w = run.work;
     const FromF known = from_f(run);
     for (int64_t i = 0; known.pairs > 0 && i < w.l; ++i)
-        if (known.has(i) && !(std::abs(w.residual[i]) <= MOST_MISSED * std::abs(w.before[i]) + MISSED_BANDS * w.band[i]))
+        if (known.has(i) &&
+            !(std::abs(w.residual[i]) <= MOST_MISSED * std::abs(w.before[i]) + MISSED_BANDS * w.band[i]))
             return true;
     return false;
 }

@@ -549,8 +549,8 @@ struct PlainMethod : Method {
 };
 
 inline bool is_plain(const Method &m, const Options &o) {
-    const bool whole =
-        o.frame.rows == 0 && o.balances.count == 0 && o.balance_groups.count == 0 && o.columns.count == 0 && o.pairs == 0;
+    const bool whole = o.frame.rows == 0 && o.balances.count == 0 && o.balance_groups.count == 0 &&
+                       o.columns.count == 0 && o.pairs == 0;
     const bool once = o.direction == NEW && o.iterations == 1 && o.every == 1 && !o.has_limits;
     return whole && once && !o.compensated && !o.adaptive && !m.nystrom && !m.paired && !m.multistep;
 }
