@@ -31,7 +31,7 @@ __all__ = ["Run", "Start"]
 
 START_ITERATIONS = 50
 # Steps without projections that are made for comparison in a faulty run, and how much longer they are in one that ends.
-FREE_STEPS, SLOWED, LEAST_STEPS = 10, 5.0, 100
+FREE_STEPS, SLOWED, LEAST_STEPS = 10, 10.0, 100
 COMBINATION_DISTANCE = 1e-4
 
 # Attributes that `restore` makes again, and those that a copy does not need.
