@@ -116,7 +116,9 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
     rows: Array = np.zeros(0, int)
     if n % 2 == 0 and not (run.tangents.count or method.in_python):
         alone = invariants.of_values(np.diff(invariants.starts) == 1)  # an item is evaluated as a whole
-        rows = np.flatnonzero(alone & (invariants.computed if n > FEW else invariants.by_numbers))
+        rows = np.flatnonzero(
+            alone & (~invariants.of_values(invariants.given_gradients) if n > FEW else invariants.by_numbers)
+        )
     if not (is_searched or known or names or len(rows)):
         return NOTHING
     samples = _Samples(run, y, f, is_searched)

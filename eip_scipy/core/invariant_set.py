@@ -166,8 +166,8 @@ class InvariantSet:
     Item k has the values with the indices from `starts[k]` to `starts[k + 1]`, of the shape `shapes[k]`. The `target`
     of `balances` are the values that the run integrates. `kinds` are groups of components that have the same unit, or
     None. `why_not` has, by label, the reasons why jitted invariants have no compiled gradient. Masks (l,) of the
-    values: the user gave the target of the `given`, and the gradients of the `computed` are computed because none was
-    given.
+    values: the user gave the target of the `given`, and the gradients of the `computed` come from complex steps,
+    quadratic forms or differences. `given_gradients` says of each item whether the user gave its gradient.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ class InvariantSet:
         if y0.dtype == FLOAT and any(item.gradient is None for item in given):
             self.items = tuple(self._with_gradient(item, k) for k, item in enumerate(given))
         self.given_gradients = [item.gradient is not None for item in given]
-        self.computed = ~self.of_values(self.given_gradients)
+        self.computed = self.of_values([item.gradient is None for item in self.items])
         self.uses_f = any(item.uses_f for item in self.items)
         self.scales = self._spread("scale", np.zeros(self.size))
         self.grads = [self._gradient_of(item, t0, y0) for item in self.items]

@@ -159,7 +159,8 @@ class Run:
             options = options._replace(frame=frame._replace(value=frame.value.copy(), bodies=frame.bodies.copy()))
         masses = self.conserved.masses
         if masses.size:
-            options = options._replace(masses=masses, uses_f=True)
+            computed = np.maximum(options.computed, np.isfinite(masses[:, 0]))
+            options = options._replace(masses=masses, uses_f=True, computed=computed)
         if tell:
             invariants.warn_of_gradients(self.conserved.rows_from_f)
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)

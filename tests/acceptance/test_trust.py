@@ -541,3 +541,18 @@ def test_a_bound_on_the_number_of_steps(tmp_path):
     np.testing.assert_array_equal(resumed.y[:, -1], whole.y[:, -1])
     with pytest.raises(ValueError, match="max_steps must be an integer >= 1"):
         integrate(fun, (0, 20), y0, method=EIPDOP853, max_steps=0)
+
+
+def test_a_late_and_tiny_loss_is_seen_also_by_a_compiled_gradient():
+    """Drag of 1e-8 from t = 20 on: the gradient by dual numbers is as exact as one that is given."""
+    njit = pytest.importorskip("numba").njit
+
+    @njit
+    def fun(t, y):
+        r3, drag = (y[0] ** 2 + y[1] ** 2) ** 1.5, 1e-8 if t > 20 else 0.0
+        return np.array([y[2], y[3], -y[0] / r3 - drag * y[2], -y[1] / r3 - drag * y[3]])
+
+    energy = njit(lambda t, y: (y[2] ** 2 + y[3] ** 2) / 2 - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2))
+    with pytest.warns(ProjectionWarning, match="not an invariant of this system"):
+        run = integrate(fun, (0, 60), [0.4, 0.0, 0.0, 2.0], method=EIPRK4, h=0.005, invariants=energy)
+    assert not run.trusted
