@@ -78,19 +78,18 @@ class _IntoOut(FunctionPass):
     def run_pass(self, state: Any) -> bool:
         function = state.func_ir
         function._definitions = build_definitions(function.blocks)
-        made = [_returned_array(function, block) for block in function.blocks.values() if block.is_terminated]
-        _require_alone(function, {id(call): call for call in made if call is not None})
+        ends = [block.terminator for block in function.blocks.values() if isinstance(block.terminator, ir.Return)]
+        calls = [_returned_array(function, end) for end in ends]
+        _require_alone(function, calls)
         for block in function.blocks.values():
-            block.body = list(_replaced(function, block, [call for call in made if call is not None]))
+            block.body = list(_replaced(function, block, calls))
         function._definitions = build_definitions(function.blocks)
         return True
 
 
-def _returned_array(function: Any, block: Any) -> Any:
-    """Return the call that makes the array that a block returns; None if the block returns nothing."""
-    if not isinstance(block.terminator, ir.Return):
-        return None
-    found = guard(get_definition, function, block.terminator.value)
+def _returned_array(function: Any, end: Any) -> Any:
+    """Return the call that makes the array that the statement `end` returns."""
+    found = guard(get_definition, function, end.value)
     if isinstance(found, ir.Expr) and found.op == "cast":
         found = guard(get_definition, function, found.value)
     if _maker(function, found) is None:
@@ -125,13 +124,13 @@ def _value(function: Any, variable: Any) -> Any:
     return None
 
 
-def _require_alone(function: Any, calls: dict[int, Any]) -> None:
+def _require_alone(function: Any, calls: list[Any]) -> None:
     """Raise an error if more than one of the arrays may be made in a call of the function, as in a loop."""
     labels = [
         label
         for label, block in function.blocks.items()
         for statement in block.find_insts(ir.Assign)
-        if id(statement.value) in calls
+        if any(statement.value is call for call in calls)
     ]
     after = [_reached(function.blocks, label) for label in labels]
     if len(set(labels)) < len(labels) or any(label in found for label in labels for found in after):
@@ -207,6 +206,20 @@ def zeros_like_at(a, out):
     """Return `out`, filled with zeros, as ``np.zeros_like(a)``; for compiled code only."""
 
 
+@njit
+def _of_size(size, out):
+    if size != out.size:
+        raise ValueError("an array of another size")
+    return out
+
+
+@njit
+def _zeroed(out):
+    for i in range(out.size):
+        out[i] = 0.0
+    return out
+
+
 def _is_of(out: Any, dtype: Any) -> bool:
     return isinstance(out, types.Array) and out.ndim == 1 and out.dtype == dtype
 
@@ -216,48 +229,21 @@ def _empty_at(shape, dtype, out):
     if not _is_of(out, getattr(dtype, "dtype", None)):
         return None
     if isinstance(shape, types.UniTuple) and shape.count == 1:
-        return lambda shape, dtype, out: empty_at(shape[0], dtype, out)
-    if not isinstance(shape, types.Integer):
-        return None
-
-    def checked(shape, dtype, out):
-        if shape != out.size:
-            raise ValueError("an array of another size")
-        return out
-
-    return checked
+        return lambda shape, dtype, out: _of_size(shape[0], out)
+    return (lambda shape, dtype, out: _of_size(shape, out)) if isinstance(shape, types.Integer) else None
 
 
 @overload(zeros_at)
 def _zeros_at(shape, dtype, out):
-    def filled(shape, dtype, out):
-        found = empty_at(shape, dtype, out)
-        for i in range(found.size):
-            found[i] = 0.0
-        return found
-
-    return filled
+    return lambda shape, dtype, out: _zeroed(empty_at(shape, dtype, out))
 
 
 @overload(like_at)
 def _like_at(a, out):
-    if not (isinstance(a, types.Array) and a.ndim == 1 and _is_of(out, a.dtype)):
-        return None
-
-    def checked(a, out):
-        if a.size != out.size:
-            raise ValueError("an array of another size")
-        return out
-
-    return checked
+    known = isinstance(a, types.Array) and a.ndim == 1 and _is_of(out, a.dtype)
+    return (lambda a, out: _of_size(a.size, out)) if known else None
 
 
 @overload(zeros_like_at)
 def _zeros_like_at(a, out):
-    def filled(a, out):
-        found = like_at(a, out)
-        for i in range(found.size):
-            found[i] = 0.0
-        return found
-
-    return filled
+    return lambda a, out: _zeroed(like_at(a, out))
