@@ -302,6 +302,8 @@ class Loop:
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
+            if driver.step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
+                return -1, f"max_steps={self._most_steps} steps were made, up to t={driver.now[0]:.10g}"
             if self.keeper is not None:
                 self.keeper.keep()
             rows, steps, begin = driver.rows, self._next_steps(), time.perf_counter()
@@ -325,8 +327,6 @@ class Loop:
                 if slowed := driver.run.slowed(driver.step, *driver.now):
                     self._ended_early = True
                     return -1, slowed
-            if driver.step >= self._most_steps and schedule.clock[TIME] != schedule.span.t_bound:
-                return -1, f"max_steps={self._most_steps} steps were made, up to t={driver.now[0]:.10g}"
             if code == FULL:
                 driver.grow()
             elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
