@@ -63,7 +63,7 @@ INTEGRATORS = tuple(_SETTINGS)
 _CHUNK = 100_000
 # REBOUNDx's forces and ours.
 _FORCES = {"gr": "1pn", "gr_full": "eih", "gr_potential": "gr-potential"}
-# Of lengths and times: the base unit, our names of units, and REBOUND's.
+# Units of lengths and times: the base unit, the names of units here, and REBOUND's.
 _METRES = {"AU": 149597870700.0, "m": 1.0, "cm": 0.01, "km": 1e3}
 _YEAR = 365.25 * 86400.0
 _YEARS = {"yr": _YEAR, "kyr": 1e3 * _YEAR, "Myr": 1e6 * _YEAR, "Gyr": 1e9 * _YEAR}

@@ -203,7 +203,7 @@ def test_a_slow_run_warns_once_that_its_invariant_is_not_jitted(monkeypatch):
 
 
 def test_a_quadratic_form_that_holds_near_the_start_alone():
-    """Where the function is another one, differences replace its gradient."""
+    """Differences replace the gradient at states where the function is another one."""
 
     def value(t, y):
         r2 = np.vdot(y, y).real

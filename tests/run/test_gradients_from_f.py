@@ -75,7 +75,7 @@ def is_from_f(result):
 
 
 def by_computed_gradient(fun, energy, y0, **options):
-    """The same run with a gradient by complex steps, given by hand."""
+    """Return the same run with a gradient by complex steps, given by hand."""
 
     def gradient(t, y):
         shifted = y + 1e-30j * np.eye(y.size)

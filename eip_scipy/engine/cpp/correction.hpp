@@ -514,7 +514,7 @@ inline bool refutes(const AnyRun &run) {
     return false;
 }
 
-// The projection anew with computed gradients, which the run uses from now on.
+// Repeat the projection with computed gradients, which the run uses from now on.
 [[gnu::cold, gnu::noinline]] inline Code project_without_f(const Run &run, const Step &step) {
     const Work &w = run.work;
     w.counters[FROM_F] = 0;

@@ -217,7 +217,7 @@ struct System {
         each_gradient(w, t, y, f, G);
     }
 
-    // The gradients of a run whose states have no columns, of which some are made from f.
+    // Compute the gradients, some of which are made from f, of a run whose states have no columns.
     template <class W>
     [[gnu::noinline]] void grad(const W &w, double t, const double *y, const double *f, double *G, const FromF &known) {
         if (by_pointer)
@@ -496,14 +496,14 @@ inline void evaluate_f(const AnyRun &run, double t, const double *y, double *f) 
 template <class AnyRun>
 constexpr bool IS_SINGLE = std::remove_cvref_t<decltype(std::declval<AnyRun>().system)>::MEMBERS == 1;
 
-// What the run's gradients are made from at present; empty after a projection that has refuted it.
+// Return what the run makes gradients of; it is empty after a projection that has refuted them.
 template <class AnyRun>
 inline FromF from_f(const AnyRun &run) {
     if (run.options.pairs == 0 || !run.work.counters[FROM_F]) return {};
     return {run.options.masses, run.options.pairs};
 }
 
-// The gradients at y, where the derivative is f.
+// Compute the gradients at y, where the derivative is f.
 template <class AnyRun, class Value>
 inline void gradients(const AnyRun &run, double t, const Value *y, const Value *f, Value *G) {
     if constexpr (IS_SINGLE<AnyRun>)

@@ -238,8 +238,8 @@ inline void note_slowness(double rate, double terms, int64_t b, const Work &w) {
     }
 }
 
-// The rates along the flow of the invariants whose gradients are made from f, into w.flow with the other sign: differences
-// of their values. The product of such a gradient with f tells nothing: it is 0 in each state.
+// Write the rates along the flow of the invariants whose gradients are made from f to w.flow, with the other sign. They are
+// differences of values. The product of such a gradient with f tells nothing: it is 0 in each state.
 [[gnu::cold, gnu::noinline]] inline void note_values_along_flow(const Run &run, const Step &step, const FromF &known) {
     const Work &w = run.work;
     const double part = PART_OF_STEP * step.h;

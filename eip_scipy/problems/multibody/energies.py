@@ -163,7 +163,7 @@ class Examined:
         return tuple(found)
 
     def _is_independent(self, item: Invariant, kept: Sequence[Invariant]) -> bool:
-        """Return True if the gradient of `item` is no linear combination of those of `kept` at some of the states."""
+        """Return True if the gradient of `item` is not a linear combination of those of `kept` at some states."""
         rows = np.concatenate([self.slopes(one.gradient, one.size, one.args) for one in (item, *kept)], axis=1)
         for gradient, *others in rows:
             known = np.array([row / np.linalg.norm(row) for row in others if row.any()]).reshape(-1, gradient.size)
