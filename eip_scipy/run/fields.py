@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution
 
+from ..core.event_derivatives import EVENT_DERIVATIVES
 from ..core.problem import component_names as checked
 from ..core.results import Diagnostics, Multipliers
 from ..core.tangent_vectors import StateSolution
@@ -65,7 +66,7 @@ FIELDS = {
     **dict.fromkeys(("method", "h", "message", "status", "success", "units"), Field(())),
     **dict.fromkeys(("trusted", "compiled"), Field((), operator.and_)),
     **dict.fromkeys(("nfev", "njev", "nlu", "wall_time"), Field((), operator.add)),
-    **dict.fromkeys(("t_events", "y_events"), Field(None, _by_event)),
+    **dict.fromkeys(("t_events", "y_events", *EVENT_DERIVATIVES), Field(None, _by_event)),
     **dict.fromkeys(("target", "calls", "columns", "epoch"), Field(None)),
     "component_names": Field(None, lambda one, two: one),  # the user may have assigned others
     "sol": Field(None, _solution),

@@ -14,6 +14,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..core.callers import users_level
+from ..core.event_derivatives import event_derivatives
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
 from ..core.functions import PointerFunction, is_compiled, is_jitted
@@ -32,7 +33,7 @@ from .driver import Driver, expected_steps
 from .prepare import DEFAULT, RunArguments, identity, prepared, started_at
 from .results import IntegrationResult, Origin, described
 
-__all__ = ["integrate"]
+__all__ = ["STOPPED", "integrate", "progress_bar", "used_up"]
 
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
@@ -249,7 +250,7 @@ class Loop:
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
         compiles = given.compiled is not False and is_jitted(problem.fun)
-        with _bar(given.progress and compiles, lambda: COMPILING):
+        with progress_bar(given.progress and compiles, lambda: COMPILING):
             functions, self.why_not = problem.functions(run, given.compiled)
             self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
@@ -257,6 +258,7 @@ class Loop:
             keeper.begin(self.driver, own, problem.derivative, self.events)
         self._chunk, self._seconds, self._begin = FIRST_CHUNK, 0.0, 0.0
         self._doubtful = self._event_ended = self._ended_early = False
+        self.remarks: list[str] = []  # on derivatives at events
         self._most_steps = UNBOUNDED if given.max_steps is None else given.max_steps
 
     def run(self) -> IntegrationResult:
@@ -264,7 +266,7 @@ class Loop:
         driver, keeper, result = self.driver, self.keeper, None
         self._begin = time.perf_counter() - (0.0 if keeper is None else keeper.seconds)
         try:
-            with _bar(self.given.progress, self._shown_by_bar) as bar:
+            with progress_bar(self.given.progress, self._shown_by_bar) as bar:
                 status, message = self.steps(bar)
             if keeper is not None:
                 keeper.end(status, message)
@@ -303,7 +305,7 @@ class Loop:
                 return 1, STOPPED
         while True:
             if driver.step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
-                return -1, f"max_steps={self._most_steps} steps were made, up to t={driver.now[0]:.10g}"
+                return -1, used_up(self._most_steps, driver.now[0])
             if self.keeper is not None:
                 self.keeper.keep()
             rows, steps, begin = driver.rows, self._next_steps(), time.perf_counter()
@@ -421,6 +423,7 @@ class Loop:
         if variations is not None:
             sol = None if sol is None else StateSolution(sol, run.tangents)
             asked = asked._replace(variations=run.tangents.restarted(y))
+        at_events, self.remarks = event_derivatives(run.problem, driver.schedule.span.t0, events.t, events.y)
         result = assembled(
             run,
             driver.y[: driver.rows],
@@ -440,6 +443,7 @@ class Loop:
             compiled=self.why_not is None,
             calls=run.problem.calls(run, driver.functions),
             h=abs(driver.schedule.span.h) or None,
+            **at_events,
         )
         last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
         arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
@@ -465,7 +469,7 @@ class Loop:
             notes.append(
                 f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
             )
-        return tuple(str(note) for note in (*notes, run.conserved.missing) if note is not None)
+        return tuple(str(note) for note in (*notes, run.conserved.missing, *self.remarks) if note is not None)
 
 
 def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
@@ -494,7 +498,12 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
     return result
 
 
-def _bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
+def used_up(most_steps: int, t: float) -> str:
+    """Return the reason for the end of a run at t that has made `most_steps` steps, its option `max_steps`."""
+    return f"max_steps={most_steps} steps were made, up to t={t:.10g}"
+
+
+def progress_bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
     """Return a context manager that yields a progress bar with these options of tqdm, or None if it is not `shown`."""
     if not shown:
         return nullcontext()

@@ -13,6 +13,7 @@ from scipy.optimize import OptimizeResult
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError, decoded, encoded
+from ..core.event_derivatives import EVENT_DERIVATIVES
 from ..core.inputs import shown
 from ..core.problem import Problem, component_names
 from ..core.results import Diagnostics, Multipliers
@@ -181,6 +182,7 @@ ABSENT = {
     "stm": 'this run has no state-transition matrix; ask for it with variations="state".',
     "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
     "variations": "this run carried no derivatives; ask for them with variations=...",
+    **dict.fromkeys(EVENT_DERIVATIVES, "this run has no derivatives at events; give it variations=... and events=..."),
     "multipliers": "this result has no multipliers: its problem is not a mechanical system with constraints.",
     "outputs": "this result has no outputs; give outputs={name: ...} to `mechanism` or `mechanics`.",
 }
@@ -318,6 +320,13 @@ class IntegrationResult(Result):
     variations : ndarray, shape (m, n, k)
         Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated
         and projected, as the states are. See `stm` and `sensitivities`.
+    tangent_events : list of ndarray, shape (m, n, k)
+        For each event of a run with derivatives, the columns at the m times at which it happened.
+    time_derivatives : list of ndarray, shape (m, k)
+        Derivatives of these times, along the same columns: -(grad g Phi + dg/dp) / (dg/dt + grad g f) for an event g.
+        They are NaN, and `message` says so, if the state only grazes the event, so that its rate vanishes there.
+    state_derivatives : list of ndarray, shape (m, n, k)
+        Derivatives of the states at the event, whose times shift: ``tangent_events`` plus f times ``time_derivatives``.
     columns : dict
         Description of the columns of `variations`: "state", True if the state-transition matrix is included;
         "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
@@ -363,6 +372,9 @@ class IntegrationResult(Result):
     epoch: tuple[float, float] | None
     outputs: dict[str, np.ndarray]
     multipliers: Multipliers
+    tangent_events: list[np.ndarray]
+    time_derivatives: list[np.ndarray]
+    state_derivatives: list[np.ndarray]
 
     plot = plot
 
