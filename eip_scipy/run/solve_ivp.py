@@ -218,7 +218,7 @@ def solve_ivp(
     function = _right_hand_side(fun, acceleration, t_span, y0)
     args, extra = _unpacked(args)
     watch = Watch(callback, progress, max_steps)
-    common = {"t_eval": t_eval, "dense_output": dense_output, "vectorized": vectorized, "args": args}
+    common: dict[str, Any] = {"t_eval": t_eval, "dense_output": dense_output, "vectorized": vectorized, "args": args}
     method = _with_projection(method, [name for name in options if name in OWN])
     if isinstance(method, type) and issubclass(method, EIPSolver):
         return _solve(watch, method, function, t_span, y0, extra, events, common, options)
@@ -262,7 +262,8 @@ def _solve(
         begun = lambda t, y: (solvers[0].f, solvers[0].direction * float(solvers[0].h or solvers[0].h_abs))  # noqa: E731
         common["events"] = Events(events, extra).for_scipy(begun, as_scipy=method._takes_scipys_steps(options))
     options |= {"invariants": items, "_context": Context(start, solvers, augmented)}
-    sol = watch.run(fun, t_span, start, method, tangents=augmented and augmented.tangents, **common, **options)
+    common["tangents"] = None if augmented is None else augmented.tangents
+    sol = watch.run(fun, t_span, start, method, **common, **options)
     if augmented is not None:
         _split(sol, augmented.tangents)
     if sol.status == 1:  # SciPy does not inform the solver that its run has ended

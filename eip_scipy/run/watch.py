@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.integrate import BDF, LSODA, OdeSolution
 
 from ..core.solvers import EIPSolver
 from ..core.step_control import UNBOUNDED
-from ..core.tangent_vectors import NO_TANGENT_VECTORS, TangentVectors
+from ..core.tangent_vectors import NO_TANGENT_VECTORS
 from .integrate import STOPPED, progress_bar, used_up
 from .prepare import check_watching
 
@@ -25,15 +24,13 @@ class Watch:
 
     def __init__(self, callback: Any, progress: Any, max_steps: Any) -> None:
         check_watching(callback, progress, max_steps)
-        self._callback: Callable[..., Any] | None = callback
+        self._callback: Any = callback
         self._progress, self._most_steps = progress, UNBOUNDED if max_steps is None else max_steps
         self._is_needed = callback is not None or progress or max_steps is not None
         self._rows = self._steps = 0  # saved points that the callback has received, and steps
         self._stopped = False
 
-    def run(
-        self, fun: Any, t_span: Any, y0: Any, method: Any, *, tangents: TangentVectors | None = None, **options: Any
-    ) -> Any:
+    def run(self, fun: Any, t_span: Any, y0: Any, method: Any, *, tangents: Any = None, **options: Any) -> Any:
         """Return the result of `scipy.integrate.solve_ivp`; `tangents` are the vectors in the states, or None."""
         solve = scipy.integrate.solve_ivp
         method = getattr(scipy.integrate, method, method) if isinstance(method, str) else method
@@ -61,10 +58,9 @@ class Watch:
 
         def step(solver: Any) -> tuple[bool, str | None]:
             reason = self._before_step(solver)
-            return (False, reason) if reason else super(found, solver)._step_impl()
+            return (False, reason) if reason else method._step_impl(solver)
 
-        found: Any = type(method)(method.__name__, (method,), {"_step_impl": step})
-        return found
+        return type(method)(method.__name__, (method,), {"_step_impl": step})
 
     def _before_step(self, solver: Any) -> str:
         """Report the points saved in the last step; return the reason why no further step is made, or ""."""
