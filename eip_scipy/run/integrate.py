@@ -26,12 +26,13 @@ from ..core.runs import Run
 from ..core.solvers import EIPSolver
 from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
-from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, TIME
+from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, START, TIME
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver, expected_steps
+from .origin import Origin
 from .prepare import DEFAULT, RunArguments, identity, prepared, started_at
-from .results import IntegrationResult, Origin, described
+from .results import IntegrationResult, described
 
 __all__ = ["STOPPED", "integrate", "progress_bar", "used_up"]
 
@@ -445,13 +446,20 @@ class Loop:
             h=abs(driver.schedule.span.h) or None,
             **at_events,
         )
-        last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
+        last, at_end = (np.array([t]), y[None].copy()), not self._event_ended
         arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
         arguments |= arguments.pop("projection")
+        figures, rows = run.trust.figures, slice(driver.rows - 1, driver.rows)
+        saved = driver.rows > 0 and driver.t[rows] == t and np.array_equal(driver.y[rows], y[None])
         origin = Origin(
-            arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign,
-            lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
-            lambda: values_at(*last)[0], message, self._notes(),
+            arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign, tuple(run.invariants.names),
+            terms=np.where(np.isnan(target), np.inf, figures[:, START]),  # balances have no target
+            before=values[:, -1].copy() if saved else None,
+            event=events.last_index if self._event_ended else None,
+            kept=lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
+            values=lambda: driver.values_at(*last)[0],
+            derivative=lambda: run.tangents.state(run.problem.derivative(t, last[1][0])),
+            ended=message, notes=self._notes(),
         )  # fmt: skip
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
@@ -489,6 +497,7 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
         nlu=int(counters[NLU]),
         method=run.name,
         component_names=run.problem.component_names,
+        restarts=[],
         units="" if problem is None else problem.units,
         epoch=None if problem is None else problem.epoch,
     )
@@ -522,7 +531,7 @@ def _attach_start(error: BaseException, request: RunArguments, seconds: float) -
             **dict.fromkeys(("nfev", "njev", "nlu"), 0),
             **dict.fromkeys(("success", "trusted", "compiled"), False),
             **{"t": np.array([t0]), "y": start[:, None], "invariants": nothing, "target": nothing[:, 0]},
-            **{"max_residual": nothing[:, 0], "diagnostics": Diagnostics(), "calls": {}, "units": ""},
+            **{"max_residual": nothing[:, 0], "diagnostics": Diagnostics(), "calls": {}, "units": "", "restarts": []},
             **{"status": -1, "message": f"interrupted by {type(error).__name__} at the start", "wall_time": seconds},
             method=getattr(request.method, "__name__", str(request.method)),
         )
