@@ -127,10 +127,11 @@ def integrate(
         For `EIPRadau` and `EIPBDF`, as for SciPy's Radau and BDF: ``jac(t, y[, params]) -> (n, n)``, the matrix of the
         derivatives of `fun`, dense or sparse, or a constant matrix.
     variations : str, int, sequence of these or array_like, shape (n, k), optional
-        Derivatives of the state that are integrated with it by a Runge-Kutta method, and projected so that they are
-        consistent with the invariants. ``"state"``: with respect to the initial state, the state-transition matrix
-        ``run.stm``. Names or indices of parameters: ``run.sensitivities``; a list combines several of these. An array:
-        columns with these initial values, ``run.variations``. Products with the Jacobian come from the problem, from
+        Derivatives of the state that are integrated with it by an explicit method, and projected, except by multistep
+        methods, so that they are consistent with the invariants. ``"state"``: with respect to the initial state, the
+        state-transition matrix ``run.stm``. Names or indices of parameters: ``run.sensitivities``; a list combines
+        several of these. An array: columns with these initial values, ``run.variations``. With events also
+        ``run.time_derivatives`` and ``run.state_derivatives``. Products with the Jacobian come from the problem, from
         dual numbers if the functions are jitted, from `jvp`, or else from complex steps. See
         :doc:`/how-to/tangent-maps`.
     jvp : callable, optional

@@ -271,7 +271,10 @@ def _variations(
     first = First(interval(_start(given, own)[0])[0], y0, extra)
     items = projection.invariants
     canonical, variational = (False, None) if own is None else (own.canonical, own.variational)
-    tangents = tangents.kept_symplectic(given.symplectic, canonical, bool(items))
+    reason = None if items else "without invariants no step is projected; give the energy, at least"
+    if solver.TABLEAU.has_history:
+        reason = "a multistep method projects no vectors; use EIPRKN12"
+    tangents = tangents.kept_symplectic(given.symplectic, canonical, reason)
     rhs, source = augmented_rhs(tangents, fun, form, first, given.jvp, variational)
     return Variations.of(tangents, rhs, source, first, items)
 
