@@ -184,7 +184,7 @@ def slowness(sums: np.ndarray) -> np.ndarray:
 
 def _joined_sums(one: tuple[Any, Any], two: tuple[Any, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Return places and sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation."""
-    places = np.union1d(one[0], two[0])
+    places = np.union1d(one[0], two[0]) if one[0].size or two[0].size else two[0]
     first, second = (np.zeros((data.N_SLOW, places.size)) for _ in range(2))
     first[:, np.searchsorted(places, one[0])], second[:, np.searchsorted(places, two[0])] = one[1], two[1]
     both = first + second

@@ -125,15 +125,17 @@ class _Restart:
             new["invariants"] = as_invariants(changes["invariants"])
         if "y" in changes:
             new["y0"] = self._state(changes["y"])
-        tangents = new["variations"]
+        tangents, keeps = new["variations"], new.get("invariants") is self.asked["invariants"]
+        if not isinstance(tangents, TangentVectors) and self.jacobian is not None:
+            raise ValueError("continue_to: jacobian belongs to a run with derivatives (variations=...). Omit it.")
+        if tangents is None and not (keeps and len(new["invariants"])):
+            return new  # nothing passes through the change
         request = RunArguments.of(**new | {"variations": None, "jvp": None, "symplectic": None})
         problem, projection = as_problem(request, request.method.TABLEAU, request.method)
-        if new.get("invariants") is self.asked["invariants"]:
+        if keeps:
             new["invariants"] = self._retargeted(problem, projection.invariants)
         if isinstance(tangents, TangentVectors):
             new |= {"variations": self._passed(tangents, problem), "symplectic": False}  # the change need not be
-        elif self.jacobian is not None:
-            raise ValueError("continue_to: jacobian belongs to a run with derivatives (variations=...). Omit it.")
         return new
 
     def _params(self, given: Any) -> Any:
@@ -153,7 +155,7 @@ class _Restart:
                 f"continue_to: y has {found.size} components, but the state has {before.size}; start a new run with "
                 "integrate for another number of components."
             )
-        return found
+        return found.astype(np.result_type(found, before), copy=False)
 
     def _retargeted(self, problem: BoundProblem, items: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
         """Return the invariants with new targets where the change has changed their values."""

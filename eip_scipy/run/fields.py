@@ -56,11 +56,12 @@ class Join(NamedTuple):
     """The way in which two parts of a run are joined.
 
     The first `skip` rows of the second part, the state where both meet, are left out. `grown` has the arrays of the
-    first result that grow, and gets those of the joined one.
+    first result that grow, and gets those of the joined one. `rows` are the numbers of rows of both parts.
     """
 
     skip: int
     grown: dict[str, Growing]
+    rows: tuple[int, int]
 
     def along(self, key: str, one: np.ndarray, two: np.ndarray, axis: int = 0, skip: int | None = None) -> np.ndarray:
         """Return two arrays concatenated along an axis; `key` names the array that grows."""
@@ -68,24 +69,24 @@ class Join(NamedTuple):
         found = self.grown.get(key)
         if found is None or not found.ends_with(one, len(two), two):
             count = len(one) + len(two)
-            found = self.grown[key] = Growing(count + count // 2, two, np.result_type(one, two))
+            found = self.grown[key] = Growing(8 + count + count // 2, two, np.result_type(one, two))
             found.append(one)
         found.append(two)
         return found.array[: found.used].swapaxes(0, axis)
 
 
-Joined = Callable[[str, Any, Any, Join], Any]
+JoinFunction = Callable[[str, Any, Any, Join], Any]
 
 
 def _last(name: str, one: Any, two: Any, join: Join) -> Any:
     return two
 
 
-def _by(function: Callable[[Any, Any], Any]) -> Joined:
+def _by(function: Callable[[Any, Any], Any]) -> JoinFunction:
     return lambda name, one, two, join: function(one, two)
 
 
-def _rows(axis: int) -> Joined:
+def _rows(axis: int) -> JoinFunction:
     return lambda name, one, two, join: join.along(name, one, two, axis)
 
 
@@ -97,16 +98,20 @@ def _by_event(name: str, one: Any, two: Any, join: Join) -> Any:
     return [join.along(f"{name} {k}", a, b, skip=0) if a.size and b.size else b if b.size else a for k, (a, b) in pairs]
 
 
-def _outputs(name: str, one: Any, two: Any, join: Join) -> Any:
-    return {key: join.along(f"{name} {key}", one[key], two[key]) for key in two.keys() & one.keys()}
+def _outputs(name: str, one: dict[str, Any], two: dict[str, Any], join: Join) -> Any:
+    """Return the outputs of both parts, which are NaN in a part that does not have them."""
+
+    def of(part: dict[str, Any], key: str, rows: int) -> Any:
+        return part[key] if key in part else np.full(rows, np.nan)
+
+    ends, keys = join.rows, dict.fromkeys([*one, *two])
+    return {key: join.along(f"{name} {key}", of(one, key, ends[0]), of(two, key, ends[1])) for key in keys}
 
 
-def _multipliers(name: str, one: Any, two: Any, join: Join) -> Any:
-    values, rank = (
-        join.along(f"{name} values", one.values, two.values, 1),
-        join.along(f"{name} rank", one.rank, two.rank),
-    )
-    return Multipliers(two.names, values, rank)
+def _multipliers(name: str, one: Multipliers, two: Multipliers, join: Join) -> Any:
+    first, second = (dict(zip(distinct(part.names), part.values, strict=True)) for part in (one, two))
+    values = _outputs(name, first, second, join)
+    return Multipliers(tuple(values), np.array([*values.values()]), join.along(f"{name} rank", one.rank, two.rank))
 
 
 def _solution(name: str, one: OdeSolution | None, two: OdeSolution | None, join: Join) -> OdeSolution | None:
@@ -114,12 +119,10 @@ def _solution(name: str, one: OdeSolution | None, two: OdeSolution | None, join:
         return None
     if one.t_min == one.t_max:  # a part without steps
         return two
-    known = (
-        one.interpolants
-        if type(one.interpolants) is list and len(one.interpolants) == len(one.ts) - 1
-        else [*one.interpolants]
-    )
-    known.extend(two.interpolants)  # a solution does not see interpolants beyond its own times
+    known, count = one.interpolants, len(one.ts) - 1
+    if type(known) is not list or len(known) > count:
+        known = [*known[:count]]
+    known.extend(two.interpolants)  # `one` does not see interpolants beyond its own times
     both = OdeSolution(join.along(name, one.ts, two.ts, skip=1), known)
     return StateSolution(both, two.tangents) if isinstance(two, StateSolution) else both
 
@@ -134,7 +137,7 @@ class Field(NamedTuple):
     """
 
     dims: tuple[str, ...] | None = None
-    join: Joined = _last
+    join: JoinFunction = _last
     table: str = ""
     unset: Any = None
     absent: float | None = None
@@ -187,13 +190,15 @@ def joined(one: Any, two: Any, grown: dict[str, Growing], *, apart: bool, but: S
         for part in (one, two):
             part.setdefault("targets", np.broadcast_to(part["target"][:, None], part["invariants"].shape))
     meet = not apart and one["t"].size and two["t"].size and two["t"][0] == one["t"][-1]
-    how = Join(int(bool(meet)), grown)
+    how = Join(int(bool(meet)), grown, (one["t"].size, two["t"].size))
+    for part, other in ((one, two), (two, one)):  # systems of different kinds
+        if "outputs" in other:
+            part.setdefault("outputs", {})
+        if "multipliers" in other:
+            rows = part["t"].size
+            part.setdefault("multipliers", Multipliers((), np.zeros((0, rows)), np.zeros(rows, int)))
     found = {name: value for name, value in two.items() if name in but or name not in one}
-    found |= {name: FIELDS[name].join(name, one[name], two[name], how) for name in two.keys() - found.keys()}
-    for name in OBSERVED:
-        if (name in one) != (name in two):  # systems of different kinds
-            found[name] = {}
-    return found
+    return found | {name: FIELDS[name].join(name, one[name], two[name], how) for name in two.keys() - found.keys()}
 
 
 def _with_all_invariants(one: dict[str, Any], two: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -20,6 +20,7 @@ from eip_scipy import (
     load,
 )
 from eip_scipy.methods import Tableau
+from eip_scipy.problems import kepler as ready
 
 G = 9.81
 TIGHT = {"method": EIPDOP853, "rtol": 1e-11, "atol": 1e-13}
@@ -94,14 +95,31 @@ def test_derivatives_after_bounces_by_the_height(from_file, tmp_path):
         )
 
 
+def test_derivatives_by_the_restitution():
+    """T2: a parameter of the bounce alone, whose column the Jacobian has behind those of the state."""
+    e = 0.8
+    fall = lambda t, y, p: np.array([y[1], -p[0] + 0 * y[0]])  # noqa: E731
+    run = integrate(fall, (0, 9), [1.0, 0.0], params=[G, e], variations=[1], events=ground, **TIGHT)
+    for _ in range(4):
+        jacobian = lambda y: [[0.0, 0.0, 0.0], [0.0, -e, -y[1]]]  # noqa: E731
+        run = run.continue_to(9, y=lambda y: [0.0, -e * y[1]], jacobian=jacobian)
+    k = np.arange(5)
+    np.testing.assert_allclose(
+        run.time_derivatives[0][:, 0], 2 * np.sqrt(2 / G) * np.cumsum(k * e ** (k - 1.0)), rtol=1e-11
+    )
+    np.testing.assert_allclose(run.state_derivatives[0][1:, 1, 0], (k * run.y_events[0][:, 1] / e)[1:], rtol=1e-11)
+
+
 def test_results_of_one_run_continued_twice_are_independent():
-    first = bouncing(0.9, 1.0, 9.0, most=3)
+    first = bouncing(0.9, 1.0, 9.0, most=3, dense_output=True)
     ahead = first.continue_to(9.0, y=lambda y: [0.0, -y[1]])
     other = first.continue_to(9.0, y=lambda y: [0.0, -0.5 * y[1]])
     for run in (ahead, other):
         np.testing.assert_array_equal(run.y[:, : first.t.size], first.y)
+        np.testing.assert_allclose(run.sol(run.t[-1] - 0.01)[1], run.y[1, -1] + 0.01 * G)
     assert ahead.t_events[0][-1] - first.t[-1] == pytest.approx(2 * (other.t_events[0][-1] - first.t[-1]))
     assert len(first.restarts) == 2
+    assert np.shares_memory(first.y, ahead.y)  # so that a loop of restarts does not copy all rows each time
 
 
 def test_a_pendulum_whose_gravity_changes():
@@ -323,6 +341,23 @@ def test_refuses():
     refuse(wide.continue_to, [({"t": 2.0} | given, *rest) for given, *rest in rows])
     turned = wide.continue_to(2.0, y=turn, jacobian=lambda y: -np.eye(2))
     np.testing.assert_allclose(turned.stm[-1], [[-1, -2], [0, -1]], atol=1e-12)
+
+
+def test_problems(tmp_path):
+    """A loaded run goes on with the same bits; a function in place of a problem keeps its step, not its invariants."""
+    run = integrate(ready(), (0, 5), method=EIPRK4, variations="state")
+    longer, again = run.continue_to(9), reloaded(run, tmp_path).continue_to(9, fun=ready())
+    np.testing.assert_array_equal(again.y, longer.y)
+    np.testing.assert_array_equal(again.stm, longer.stm)
+    assert again.restarts == longer.restarts == []
+    other = integrate(ready(), (0, 5), method=EIPRK4).continue_to(9, fun=lambda t, y: ready().fun(t, y))
+    assert (other.h, other.restarts, other.diagnostics.names) == (0.03, [(5.0, "fun")], ("H", "L"))
+    np.testing.assert_allclose(other.y[:, -1], longer.y[:, -1], rtol=0, atol=1e-4)
+    heavier = other.continue_to(12, fun=ready(), params=[0.02])
+    assert heavier.targets[0, 0] == run.target[0] > heavier.target[0]
+    assert heavier.target[1] == pytest.approx(run.target[1], rel=1e-4)
+    assert np.isnan(heavier.invariants[:, 2:4]).all()
+    assert heavier.trusted
 
 
 def test_a_loaded_run_takes_the_functions_that_it_had(tmp_path):
