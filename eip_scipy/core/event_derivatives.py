@@ -40,7 +40,7 @@ class EventGradient:
             if tangents.parameters:
                 given = (extra[0].astype(z.dtype),)
                 given[0][list(tangents.parameters)] = z[n:-1]
-            return fun(z[-1], z[:n], *given)
+            return fun(z[-1], z[:n].copy(), *given)  # the event may overwrite its state
 
         z, takes_complex = self._variables(t, row), not isinstance(fun, PointerFunction)
         floors = typical_sizes(z, np.zeros(z.size), 0.0)

@@ -70,8 +70,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     asked = {name: value for name, value in origin.arguments.items() if name not in FIRST_PART}
     asked |= {"t_span": (origin.t, t), "y0": origin.y, "invariants": origin.kept()}
     if result.t_events is not None:
-        own = asked["fun"].events if asked["events"] is None and isinstance(asked["fun"], Problem) else asked["events"]
-        asked["events"] = ContinuedEvents(as_events(own), result.t_events, moved=bool(changes))
+        asked["events"] = ContinuedEvents(_events(asked), result.t_events, moved=bool(changes))
     if changes:
         asked = _Restart(result, origin, asked, changes, options).arguments()
     elif options.get("jacobian") is not None:
@@ -297,14 +296,19 @@ def _require_same(origin: Origin, names: Sequence[str], there: Array, now: Array
         )
 
 
+def _events(arguments: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the events of a run with these arguments of `integrate`, by default those of its problem."""
+    events, fun = arguments["events"], arguments["fun"]
+    return as_events(fun.events if events is None and isinstance(fun, Problem) else events)
+
+
 def _joined(
     one: IntegrationResult, first: Origin, two: IntegrationResult, changes: dict[str, Any], what: str
 ) -> IntegrationResult:
     """Return one result for a run, which has the origin `first`, and its continuation, which begins with `changes`."""
     last = vars(two)["_origin"]
     before, after = (
-        [getattr(event, "pointer", event) for event in as_events(origin.arguments["events"])]
-        for origin in (first, last)
+        [getattr(event, "pointer", event) for event in _events(origin.arguments)] for origin in (first, last)
     )
     if changes or any(name in one for name in OBSERVED):  # the functions that compute them may have changed
         one._observe()

@@ -20,6 +20,7 @@ from eip_scipy import (
     load,
 )
 from eip_scipy.methods import Tableau
+from eip_scipy.problems import Problem
 from eip_scipy.problems import kepler as ready
 
 G = 9.81
@@ -312,7 +313,8 @@ def test_a_wall_moves_the_state_away_from_its_event():
         return y[0] - 1
 
     wall.terminal = True
-    run = integrate(lambda t, y: [y[1], 0.0], (0, 9), [0.25, 0.5], method=EIPRK4, h=0.1, events=wall)
+    free = Problem("free", lambda t, y: [y[1], 0.0], y0=[0.25, 0.5], t_span=(0, 9), events=wall)
+    run = integrate(free, method=EIPRK4, h=0.1)
     for _ in range(3):
         run = run.continue_to(9, y=lambda y: y - [1, 0])
     np.testing.assert_allclose(run.t_events[0], [1.5, 3.5, 5.5, 7.5], rtol=1e-13)
@@ -339,6 +341,13 @@ def test_refuses():
         ({"fun": falling, "jacobian": np.eye(2)}, ValueError, "Give both"),
     ]
     refuse(wide.continue_to, [({"t": 2.0} | given, *rest) for given, *rest in rows])
+    top = lambda t, y: y[0] - (1 - 1e-14)  # noqa: E731
+    top.terminal = True
+    grazes = integrate(
+        lambda t, y: [y[1], -y[0]], (0, 9), [0.0, 1.0], method=EIPDOP853, h=0.1, events=top, variations="state"
+    )
+    given = {"t": 9.0, "y": turn, "jacobian": -np.eye(2)}
+    refuse(grazes.continue_to, [(given, ValueError, "event 0, at which the run ended, has no derivatives")])
     turned = wide.continue_to(2.0, y=turn, jacobian=lambda y: -np.eye(2))
     np.testing.assert_allclose(turned.stm[-1], [[-1, -2], [0, -1]], atol=1e-12)
 
