@@ -173,6 +173,12 @@ class _Restart:
 
     def _passed(self, tangents: TangentVectors, problem: BoundProblem) -> TangentVectors:
         """Return the tangent vectors behind the change, whose time shifts with the event at which it happens."""
+        known = [list(getattr(fun, "parameters", ())) for fun in (self.asked["fun"], self.new["fun"])]
+        if tangents.parameters and known[0] != known[1]:
+            raise ValueError(
+                f"continue_to: the run carries derivatives by parameters, and fun has others, {known[1]}, than before, "
+                f"{known[0]}. Start a new run from the last state."
+            )
         n, vectors, k = tangents.n, tangents.initial.copy(), self.origin.event
         in_time = np.zeros(tangents.count)
         if k is not None:

@@ -126,6 +126,12 @@ def test_results_of_one_run_continued_twice_are_independent():
 def test_a_pendulum_whose_gravity_changes():
     """T3: the energy gets a new target, with the parameters that a mapping names."""
     pendulum = hamiltonian("p**2/(2*m) - g*m*cos(q)", params={"g": 9.81, "m": 1.2})
+    other = hamiltonian("p**2/2 - k*cos(q)", params={"k": 1.0})
+    by_mass = integrate(pendulum, (0, 1), [1.0, 0.0], variations=["m"], **TIGHT)
+    refuse(
+        by_mass.continue_to,
+        [({"t": 2, "fun": other}, ValueError, r"fun has others, \['k'\], than before, \['g', 'm'\]")],
+    )
     run = integrate(pendulum, (0, 1), [1.0, 0.0], params={"m": 0.7}, **TIGHT).continue_to(3, params={"g": 1.62})
     y = [1.0, 0.0]
     for g, span in ((9.81, (0, 1)), (1.62, (1, 3))):
