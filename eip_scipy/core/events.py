@@ -30,18 +30,24 @@ def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[.
 
     If `events` is a `ContinuedEvents`, the result is one too, with the same times in `happened`.
     """
-    return ContinuedEvents(others, events.happened) if isinstance(events, ContinuedEvents) else tuple(others)
+    if isinstance(events, ContinuedEvents):
+        return ContinuedEvents(others, events.happened, moved=events.moved)
+    return tuple(others)
 
 
 class ContinuedEvents(tuple):
-    """Events of a continued run, and the times at which each has happened before."""
+    """Events of a continued run, and the times at which each has happened before.
+
+    If the run has `moved`, its state or equations have changed where it continues.
+    """
 
     happened: tuple[np.ndarray, ...]
+    moved: bool
 
-    def __new__(cls, events: Any, happened: Any) -> ContinuedEvents:
+    def __new__(cls, events: Any, happened: Any, *, moved: bool = False) -> ContinuedEvents:
         """Make the tuple from the events and, for each event, the times at which it has happened."""
         found = super().__new__(cls, events)
-        found.happened = tuple(happened)
+        found.happened, found.moved = tuple(happened), moved
         return found
 
 
@@ -70,9 +76,11 @@ class Events:
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
         self._happened = items.happened if isinstance(items, ContinuedEvents) else (None,) * len(items)
+        self._moved = isinstance(items, ContinuedEvents) and items.moved
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
         self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
+        self.last_index = -1
 
     @property
     def terminal(self) -> bool:
@@ -111,7 +119,7 @@ class Events:
     def _note(self, k: int, t: float, y: np.ndarray) -> None:
         self.t[k].append(t)
         self.y[k].append(y)
-        self.last = t, y
+        self.last, self.last_index = (t, y), k
 
     def at_start(self, t: float, y: np.ndarray, f: np.ndarray, step: float) -> np.ndarray:
         """Return the values of all events at the start (t, y) of a run; 0 for those that do not happen there.
@@ -121,7 +129,7 @@ class Events:
         """
         values = [self._value(k, t, y.copy()) for k in range(len(self.functions))]
         for k, (value, known) in enumerate(zip(values, self._happened, strict=True)):
-            if self._is_zero(k, value, t, y, f, step) if known is None else t in known[-1:]:
+            if self._is_zero(k, value, t, y, f, step) if known is None or self._moved else t in known[-1:]:
                 values[k] = 0.0
         return np.array(values, float)
 

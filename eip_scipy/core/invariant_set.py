@@ -20,7 +20,7 @@ from .derivatives import NumericalGradient, difference_gradient, typical_sizes, 
 from .functions import NotCompilableError, PointerFunction, names
 from .inputs import filled, numbers, require_arguments, shown, states
 from .invariant_checks import findings, listed, reported, time_derivative
-from .invariants import Invariant, as_invariants, copied
+from .invariants import Invariant, as_invariants, with_targets
 
 __all__ = ["BalanceSet", "InvariantSet", "check_gradient"]
 
@@ -350,15 +350,9 @@ class InvariantSet:
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
         """Return the invariants, with targets, for a run that continues this one; those of balances only `at_end`."""
-        kept = list(map(copied, self.items))
-        for item, ends in zip(kept, pairwise(self.starts), strict=True):
-            if item.is_balance and not at_end:
-                item.target = None
-                continue
-            item.is_measured = item.is_measured or item.target is None
-            item.target = self.target[slice(*ends)].copy()
-        # Those of a field, which are projected together, see `problems.gross_pitaevskii`.
-        return self.items.replaced(kept) if hasattr(self.items, "replaced") else tuple(kept)
+        targets = [self.target[slice(*ends)].copy() for ends in pairwise(self.starts)]
+        balances = [item.is_balance and not at_end for item in self.items]
+        return with_targets(self.items, [None if gone else x for gone, x in zip(balances, targets, strict=True)])
 
     def rates(self, adaptive: bool, functions: Sequence[Any] | None = None) -> Rates:
         """Return the `Rates` of the balances, of compiled `functions` or by default the user's.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from .inputs import count, flag, reals, shown
 if TYPE_CHECKING:
     from .particles import LinearInvariants
 
-__all__ = ["Invariant", "as_invariants", "copied", "with_args"]
+__all__ = ["Invariant", "as_invariants", "copied", "with_args", "with_targets"]
 
 Array = np.ndarray
 
@@ -194,6 +194,16 @@ def with_args(item: Invariant, args: tuple[Any, ...]) -> Invariant:
     new: Invariant = copied(item)
     new.args = args
     return new
+
+
+def with_targets(items: tuple[Invariant, ...], targets: Iterable[Any]) -> tuple[Invariant, ...]:
+    """Return copies of invariants with the `targets`, arrays or None, of a run that continues."""
+    kept = list(map(copied, items))
+    for item, target in zip(kept, targets, strict=True):
+        item.is_measured = item.is_measured or item.target is None
+        item.target = target
+    # Those of a field, which are projected together, see `problems.gross_pitaevskii`.
+    return items.replaced(kept) if hasattr(items, "replaced") else tuple(kept)
 
 
 def _target(target: Any) -> Array:

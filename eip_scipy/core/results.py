@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,11 +61,27 @@ class Diagnostics:
             found.append(f"the gradient of {self._from_f} is made of the components of f{until}")
         return tuple(found)
 
+    def spread(self, names: Sequence[str], places: Sequence[int]) -> Diagnostics:
+        """Return the record of a run of more invariants, with these `names`; its own are those at `places`."""
+
+        def whole(values: np.ndarray) -> np.ndarray:
+            out = np.zeros((len(names), *values.shape[1:]))
+            out[places] = values
+            return out
+
+        more, (of_balances, sums) = Diagnostics(), self._slow
+        trust = Trust(names, whole(self._trust.figures))
+        trust.doubts, trust.failed = self._trust.doubts, self._trust.failed
+        slow = np.asarray(places, np.int64)[of_balances], sums
+        own = {"max_residual": whole(self.max_residual), "_residual": whole(self._residual)}
+        more._attach(**vars(self) | own | {"_trust": trust, "_slow": slow})
+        return more
+
     def followed_by(self, other: Diagnostics) -> Diagnostics:
         """Return the record of this run and of the run with the record `other`, which continued it, together."""
         both = Diagnostics()
         both._attach(
-            max_residual=np.maximum(self.max_residual, other.max_residual),
+            max_residual=np.fmax(self.max_residual, other.max_residual),
             _residual=other._residual.copy(),
             _max_correction=np.maximum(self._max_correction, other._max_correction),
             _counters=self._counters + other._counters,
@@ -72,7 +89,7 @@ class Diagnostics:
             _estimated=self._estimated and other._estimated,
             moved=self.moved or other.moved,
             _remarks=tuple(dict.fromkeys(self.remarks + other.remarks)),
-            _slow=(other._slow[0], _joined_sums(self._slow[1], other._slow[1])),
+            _slow=_joined_sums(self._slow, other._slow),
         )
         return both
 
@@ -165,13 +182,16 @@ def slowness(sums: np.ndarray) -> np.ndarray:
     return np.max(np.where(known, rates, np.nan) / np.where(known, terms, 1.0), axis=0)
 
 
-def _joined_sums(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Return the sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation together."""
-    both = one + two
+def _joined_sums(one: tuple[Any, Any], two: tuple[Any, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Return places and sums of rates and terms (`N_SLOW`, b), see `slowness`, of a run and its continuation."""
+    places = np.union1d(one[0], two[0]) if one[0].size or two[0].size else two[0]
+    first, second = (np.zeros((data.N_SLOW, places.size)) for _ in range(2))
+    first[:, np.searchsorted(places, one[0])], second[:, np.searchsorted(places, two[0])] = one[1], two[1]
+    both = first + second
     late = [data.LATE_RATES, data.LATE_TERMS]
-    kept = (one[data.SAMPLES] / np.maximum(both[data.SAMPLES], 1.0)) ** (1 / data.LATE_SHARE)
-    both[late] = kept * one[late] + two[late]
-    return both
+    kept = (first[data.SAMPLES] / np.maximum(both[data.SAMPLES], 1.0)) ** (1 / data.LATE_SHARE)
+    both[late] = kept * first[late] + second[late]
+    return places, both
 
 
 class Multipliers(NamedTuple):

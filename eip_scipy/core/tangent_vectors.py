@@ -143,9 +143,11 @@ class TangentVectors:
         """Return the vectors at the start of a run that continues from an augmented state."""
         return replace(self, initial=rows[self.order[1:]].T.copy())
 
-    def kept_symplectic(self, asked: bool | None, canonical: bool, has_invariants: bool) -> TangentVectors:
-        """Return the vectors with `symplectic` as `asked`, by default as `canonical`, the problem's, where possible."""
-        reason = None
+    def kept_symplectic(self, asked: bool | None, canonical: bool, reason: str | None) -> TangentVectors:
+        """Return the vectors with `symplectic` as `asked`, by default as `canonical`, the problem's, where possible.
+
+        `reason` says why the steps do not project vectors, or is None if they do.
+        """
         if not self.is_transition or self.parameters:
             reason = (
                 "derivatives with respect to parameters or along given directions are not a state-transition matrix; "
@@ -153,8 +155,6 @@ class TangentVectors:
             )
         elif self.n % 2:
             reason = f"a state of {self.n} components is not (q, p); omit symplectic"
-        elif not has_invariants:
-            reason = "without invariants no step is projected; give the energy, at least"
         if asked and reason is not None:
             raise ValueError(f"symplectic=True: {reason}.")
         return replace(self, symplectic=reason is None and (canonical if asked is None else bool(asked)))
@@ -177,10 +177,10 @@ class StateSolution(OdeSolution):
 
 def tangent_vectors(asked: Any, method: Any, y0: Array, params: Array, names: Sequence[str] = ()) -> TangentVectors:
     """Return the vectors for the option `variations`, `asked`; `params` and `names` are the run's parameters."""
-    if method.TABLEAU.has_history or method.TABLEAU.in_python:
+    if method.TABLEAU.in_python:
         raise ValueError(
             f"variations: {method.__name__} carries no derivatives, because its steps do not consist of stages of a "
-            "tableau. Use EIPDOP853, EIPRKN12 or another explicit Runge-Kutta or Nystrom method."
+            "tableau or of a multistep formula. Use EIPDOP853, EIPRKN12, EIPGJ12 or another explicit method."
         )
     in_halves = method.TABLEAU.of_second_order
     if isinstance(asked, TangentVectors):  # of a run that is continued
@@ -192,7 +192,8 @@ def tangent_vectors(asked: Any, method: Any, y0: Array, params: Array, names: Se
         own = tuple(_parameter(item, params, names) for item in items if item != STATE)
         if own and in_halves:
             raise ValueError(
-                "variations: Nystrom methods give no derivatives with respect to parameters; use EIPDOP853."
+                f"variations: {method.__name__} gives no derivatives with respect to parameters. Use EIPDOP853 or "
+                "another Runge-Kutta method."
             )
         if len(set(own)) < len(own) or list(items).count(STATE) > 1:
             raise ValueError(f"variations: {shown(asked)} asks for the same derivatives twice.")

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from ..checkpoint import require_place
 from ..core.conserved import NEAR_DISTANCE, confirmed, states_near
 from ..core.derivatives import unless_error
+from ..core.event_derivatives import EVENT_DERIVATIVES
 from ..core.events import Events
 from ..core.functions import PointerFunction, extra_arguments, floats, is_compiled, parameter_values
 from ..core.inputs import count, flag, shown, states
@@ -327,6 +328,8 @@ class _Collector:
             result.update(trajectories=None, invariants=at_end)
         if not plan.events:
             result.update(t_events=None, y_events=None)
+            for name in EVENT_DERIVATIVES:
+                result.pop(name, None)
         if plan.task.reduce is not None and result.reduced is None:  # all members failed
             result["reduced"] = np.full(len(result.t), np.nan)
         if ready.problem.variations is not None:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core.event_derivatives import EVENT_DERIVATIVES, event_derivatives
 from ..core.functions import CompiledFunction, NotCompilableError, PointerFunction
 from ..core.inputs import shown
 from ..core.runs import Run
@@ -124,6 +125,10 @@ class Plan:
         members = range(m if self.events else 0)
         found["t_events"] = [[np.zeros(0)] * self.events for _ in members]
         found["y_events"] = [[np.zeros((0, self.size), self.dtype)] * self.events for _ in members]
+        if self.ready.problem.variations is not None:
+            n, count = self.ready.tangents.n, self.ready.tangents.count
+            for name, shape in zip(EVENT_DERIVATIVES, ((n, count), (count,), (n, count)), strict=True):
+                found[name] = [[np.zeros((0, *shape))] * self.events for _ in members]
         return found
 
     def run(self, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> dict[str, Any]:
@@ -189,6 +194,8 @@ class Plan:
         if self.events:
             found["t_events"] = [np.array(t) for t in loop.events.t]
             found["y_events"] = [np.array(y, self.dtype).reshape(len(y), self.size) for y in loop.events.y]
+            derivatives, remarks = event_derivatives(driver.run.problem, self.t0, loop.events.t, loop.events.y)
+            found |= {"message": "; ".join([found["message"], *remarks]), **derivatives}
         return found
 
 
@@ -430,6 +437,7 @@ def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
         compiled=plan.why_not is None,
         h=plan.ready.stepping.h,
         **{name: members[name][k] for name in ("message", "target", "max_residual")},
+        **{name: members[name][k] for name in EVENT_DERIVATIVES if plan.events and name in members},
     )
 
 

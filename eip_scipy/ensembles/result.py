@@ -92,6 +92,8 @@ class EnsembleResult(Result):
     variations : ndarray, shape (members, n, k) or (members, m, n, k)
         Columns of derivatives if ``variations=`` was given, in the saved states if `trajectories` has them, else in the
         last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
+    tangent_events, time_derivatives, state_derivatives : list of list of ndarray
+        With events and ``variations=``: for member k the lists of `IntegrationResult`, with one array for each event.
     outputs : dict of str to ndarray, shape (members,) or (members, m)
         For a mechanical system with ``outputs=``: values of these quantities in the same states, computed when they are
         first requested; nan where there is no state.

@@ -411,7 +411,7 @@ class _System:
         corrected = np.full(self.half, self.corrects)
         if problem is None or problem.frequencies is None:
             return self._largest_frequency(), limit, np.flatnonzero(corrected)
-        bodies, moons = problem.frequencies(self.start.y, span.t_bound - span.t0)
+        bodies, moons = problem.frequencies(self.run.tangents.state(self.start.y), span.t_bound - span.t0)
         if self.corrects:
             fast = abs(span.h) * bodies > CORRECTED_SHARE * plain
             corrected = np.repeat(fast | (fast.any() & (bodies == 0.0)), self.half // bodies.size)

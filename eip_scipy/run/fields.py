@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.integrate import OdeSolution
 
+from ..core.event_derivatives import EVENT_DERIVATIVES
 from ..core.problem import component_names as checked
 from ..core.results import Diagnostics, Multipliers
 from ..core.tangent_vectors import StateSolution
@@ -20,59 +21,157 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
 __all__ = [
-    "FIELDS", "Field", "component_names", "dataset", "distinct", "invariant_errors", "joined", "labels", "rows",
-    "time_name", "to_dataframe", "to_xarray",
+    "FIELDS", "OBSERVED", "OF_EVENTS", "Field", "component_names", "dataset", "distinct", "invariant_errors", "joined",
+    "labels", "rows", "time_name", "to_dataframe", "to_xarray",
 ]  # fmt: skip
+
+
+OF_EVENTS = ("t_events", "y_events", *EVENT_DERIVATIVES)
+OBSERVED = ("outputs", "multipliers")  # computed when they are first requested
+
+
+class Growing:
+    """An array that grows along its first axis; `used` rows belong to results.
+
+    The results of a loop of continued runs are views of the same array, so that the loop takes linear time.
+    """
+
+    def __init__(self, rows: int, like: np.ndarray, dtype: Any) -> None:
+        self.array, self.used = np.empty((rows, *like.shape[1:]), dtype), 0
+
+    def ends_with(self, view: np.ndarray, rows: int, like: np.ndarray) -> bool:
+        """Return True if `view` is all that is used, and there is room for `rows` rows like those of `like`."""
+        own, other = self.array, view.__array_interface__["data"][0]
+        fits = own.shape[1:] == like.shape[1:] == view.shape[1:] and own.dtype == np.result_type(view, like)
+        is_view = own.__array_interface__["data"][0] == other and own.strides == view.strides
+        return fits and is_view and self.used == len(view) and self.used + rows <= len(own)
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append rows, for which there is room."""
+        self.array[self.used : self.used + len(rows)] = rows
+        self.used += len(rows)
+
+
+class Join(NamedTuple):
+    """The way in which two parts of a run are joined.
+
+    The first `skip` rows of the second part, the state where both meet, are left out. `grown` has the arrays of the
+    first result that grow, and gets those of the joined one. `rows` are the numbers of rows of both parts.
+    """
+
+    skip: int
+    grown: dict[str, Growing]
+    rows: tuple[int, int]
+
+    def along(self, key: str, one: np.ndarray, two: np.ndarray, axis: int = 0, skip: int | None = None) -> np.ndarray:
+        """Return two arrays concatenated along an axis; `key` names the array that grows."""
+        one, two = one.swapaxes(0, axis), two.swapaxes(0, axis)[self.skip if skip is None else skip :]
+        found = self.grown.get(key)
+        if found is None or not found.ends_with(one, len(two), two):
+            count = len(one) + len(two)
+            found = self.grown[key] = Growing(8 + count + count // 2, two, np.result_type(one, two))
+            found.append(one)
+        found.append(two)
+        return found.array[: found.used].swapaxes(0, axis)
+
+
+JoinFunction = Callable[[str, Any, Any, Join], Any]
+
+
+def _last(name: str, one: Any, two: Any, join: Join) -> Any:
+    return two
+
+
+def _by(function: Callable[[Any, Any], Any]) -> JoinFunction:
+    return lambda name, one, two, join: function(one, two)
+
+
+def _rows(axis: int) -> JoinFunction:
+    return lambda name, one, two, join: join.along(name, one, two, axis)
+
+
+def _by_event(name: str, one: Any, two: Any, join: Join) -> Any:
+    """Return what was recorded for each event; an array without events may have another shape."""
+    if one is None or two is None:
+        return two
+    pairs = enumerate(zip(one, two, strict=True))
+    return [join.along(f"{name} {k}", a, b, skip=0) if a.size and b.size else b if b.size else a for k, (a, b) in pairs]
+
+
+def _outputs(name: str, one: dict[str, Any], two: dict[str, Any], join: Join) -> Any:
+    """Return the outputs of both parts, which are NaN in a part that does not have them."""
+
+    def of(part: dict[str, Any], key: str, rows: int) -> Any:
+        return part[key] if key in part else np.full(rows, np.nan)
+
+    ends, keys = join.rows, dict.fromkeys([*one, *two])
+    return {key: join.along(f"{name} {key}", of(one, key, ends[0]), of(two, key, ends[1])) for key in keys}
+
+
+def _multipliers(name: str, one: Multipliers, two: Multipliers, join: Join) -> Any:
+    first, second = (dict(zip(distinct(part.names), part.values, strict=True)) for part in (one, two))
+    values = _outputs(name, first, second, join)
+    return Multipliers(tuple(values), np.array([*values.values()]), join.along(f"{name} rank", one.rank, two.rank))
+
+
+def _solution(name: str, one: OdeSolution | None, two: OdeSolution | None, join: Join) -> OdeSolution | None:
+    if one is None or two is None:
+        return None
+    if one.t_min == one.t_max:  # a part without steps
+        return two
+    known, count = one.interpolants, len(one.ts) - 1
+    if type(known) is not list or len(known) > count:
+        known = [*known[:count]]
+    known.extend(two.interpolants)  # `one` does not see interpolants beyond its own times
+    both = OdeSolution(join.along(name, one.ts, two.ts, skip=1), known)
+    return StateSolution(both, two.tangents) if isinstance(two, StateSolution) else both
 
 
 class Field(NamedTuple):
     """The declaration of a field of a result.
 
     `dims` are its dimensions in tables, () for a number or text that describes the whole run, None if tables leave it
-    out. ``join(one, two)`` returns the field of a run and its continuation. Without it fields along t are concatenated,
-    or computed when they are first requested, and others are those of the continuation. `table` is the name in tables,
-    if it is another one, and `unset` the value for a member of an ensemble that did not run.
+    out. ``join(name, one, two, how)`` returns the field of a run and its continuation, by default that of the
+    continuation. `table` is the name in tables, if it is another one, and `unset` the value for a member of an ensemble
+    that did not run. A field of each invariant is `absent` in a part of a run that does not have this invariant.
     """
 
     dims: tuple[str, ...] | None = None
-    join: Callable[[Any, Any], Any] | None = None
+    join: JoinFunction = _last
     table: str = ""
     unset: Any = None
+    absent: float | None = None
 
 
-def _by_event(one: list[np.ndarray] | None, two: list[np.ndarray] | None) -> list[np.ndarray] | None:
-    """Return what was recorded for each event; an array without events may have another shape."""
-    if one is None or two is None:
-        return two
-    return [np.concatenate([a, b]) if a.size and b.size else b if b.size else a for a, b in zip(one, two, strict=True)]
-
-
-def _solution(one: OdeSolution | None, two: OdeSolution | None) -> OdeSolution | None:
-    if one is None or two is None:
-        return None
-    both = OdeSolution(np.append(one.ts, two.ts[1:]), [*one.interpolants, *two.interpolants])
-    return StateSolution(both, two.tangents) if isinstance(two, StateSolution) else both
+def _target(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(two), one, two)
 
 
 FIELDS = {
-    "t": Field(("t",)),
-    "y": Field(("component", "t")),
-    "invariants": Field(("invariant", "t")),
-    "max_residual": Field(("invariant",), np.maximum),
-    "variations": Field(("t", "component", "column")),
-    "outputs": Field(("output", "t")),
-    "multipliers": Field(("constraint", "t")),
+    "t": Field(("t",), _rows(0)),
+    "y": Field(("component", "t"), _rows(1)),
+    "invariants": Field(("invariant", "t"), _rows(1), absent=np.nan),
+    "targets": Field(("invariant", "t"), _rows(1), absent=np.nan),
+    "target": Field(None, _by(_target), absent=np.nan),
+    "max_residual": Field(("invariant",), _by(np.fmax), absent=0.0),
+    "variations": Field(("t", "component", "column"), _rows(0)),
+    "outputs": Field(("output", "t"), _outputs),
+    "multipliers": Field(("constraint", "t"), _multipliers),
     **dict.fromkeys(("method", "h", "message", "status", "success", "units"), Field(())),
-    **dict.fromkeys(("trusted", "compiled"), Field((), operator.and_)),
-    **dict.fromkeys(("nfev", "njev", "nlu", "wall_time"), Field((), operator.add)),
-    **dict.fromkeys(("t_events", "y_events"), Field(None, _by_event)),
-    **dict.fromkeys(("target", "calls", "columns", "epoch"), Field(None)),
-    "component_names": Field(None, lambda one, two: one),  # the user may have assigned others
+    **dict.fromkeys(("trusted", "compiled"), Field((), _by(operator.and_))),
+    **dict.fromkeys(("nfev", "njev", "nlu", "wall_time"), Field((), _by(operator.add))),
+    **dict.fromkeys(OF_EVENTS, Field(None, _by_event)),
+    **dict.fromkeys(("calls", "columns", "epoch"), Field(None)),
+    "component_names": Field(None, lambda name, one, two, join: one),  # the user may have assigned others
     "sol": Field(None, _solution),
-    "diagnostics": Field(None, Diagnostics.followed_by),
+    "diagnostics": Field(None, _by(Diagnostics.followed_by)),
+    "restarts": Field(None, _by(operator.add)),
 }
-# Axis of t of the fields along t.
-ALONG = {name: field.dims.index("t") for name, field in FIELDS.items() if field.dims and "t" in field.dims}
+# Axis of t of the fields along t that a run always has.
+ALONG = {
+    name: field.dims.index("t") for name, field in FIELDS.items()
+    if field.dims and "t" in field.dims and field.join not in (_outputs, _multipliers)
+}  # fmt: skip
 
 
 def rows(result: Any, part: slice) -> dict[str, np.ndarray]:
@@ -80,20 +179,43 @@ def rows(result: Any, part: slice) -> dict[str, np.ndarray]:
     return {name: result[name][(slice(None),) * axis + (part,)] for name, axis in ALONG.items() if name in result}
 
 
-def joined(one: Any, two: Any, but: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the fields of a run and its continuation together, except those in `but`.
+def joined(one: Any, two: Any, grown: dict[str, Growing], *, apart: bool, but: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the fields of a run and its continuation together; those in `but` are of the continuation alone.
 
-    The state where both meet is stored once.
+    The state where both meet is stored once, or twice if the parts are `apart`, because something has changed there.
     """
     assert two.keys() <= FIELDS.keys()  # a field that is not declared would be that of the continuation alone
-    meet = one["t"].size and two["t"].size and two["t"][0] == one["t"][-1]
-    found: dict[str, Any] = {}
-    for name, new in rows(two, slice(1 if meet else 0, None)).items():
-        found[name] = np.concatenate([one[name], new], axis=ALONG[name])
-    for name, field in FIELDS.items():
-        if field.join is not None and name in two and name not in but:
-            found[name] = field.join(one[name], two[name])
-    return found
+    one, two = _with_all_invariants(dict(one), dict(two))
+    if "targets" in one or not np.array_equal(one["target"], two["target"], equal_nan=True):
+        for part in (one, two):
+            part.setdefault("targets", np.broadcast_to(part["target"][:, None], part["invariants"].shape))
+    meet = not apart and one["t"].size and two["t"].size and two["t"][0] == one["t"][-1]
+    how = Join(int(bool(meet)), grown, (one["t"].size, two["t"].size))
+    for part, other in ((one, two), (two, one)):  # systems of different kinds
+        if "outputs" in other:
+            part.setdefault("outputs", {})
+        if "multipliers" in other:
+            rows = part["t"].size
+            part.setdefault("multipliers", Multipliers((), np.zeros((0, rows)), np.zeros(rows, int)))
+    found = {name: value for name, value in two.items() if name in but or name not in one}
+    return found | {name: FIELDS[name].join(name, one[name], two[name], how) for name in two.keys() - found.keys()}
+
+
+def _with_all_invariants(one: dict[str, Any], two: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the fields of two parts of a run with the invariants of both, those of the first part first."""
+    known = [distinct(part["diagnostics"].names) for part in (one, two)]
+    if known[0] == known[1]:
+        return one, two
+    names = list(dict.fromkeys(known[0] + known[1]))
+    for part, own in zip((one, two), known, strict=True):
+        places = [names.index(name) for name in own]
+        for name, field in FIELDS.items():
+            if field.absent is not None and name in part:
+                whole = np.full((len(names), *part[name].shape[1:]), field.absent)
+                whole[places] = part[name]
+                part[name] = whole
+        part["diagnostics"] = part["diagnostics"].spread(names, places)
+    return one, two
 
 
 # Labels.
@@ -270,7 +392,7 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
 
 def invariant_errors(result: Any) -> np.ndarray:
     """Return the errors (l, m) of the invariants at the saved times; NaN for a `Balance`."""
-    return result.invariants - np.asarray(result.target)[:, None]
+    return result.invariants - (result["targets"] if "targets" in result else np.asarray(result.target)[:, None])
 
 
 def dataset(result: Any, fields: Mapping[str, Field], coordinates: dict[str, Any]) -> Dataset:

@@ -14,6 +14,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..core.callers import users_level
+from ..core.event_derivatives import event_derivatives
 from ..core.examination import is_check_due, steps_to_check
 from ..core.failures import failure
 from ..core.functions import PointerFunction, is_compiled, is_jitted
@@ -25,14 +26,15 @@ from ..core.runs import Run
 from ..core.solvers import EIPSolver
 from ..core.step_control import UNBOUNDED
 from ..core.tangent_vectors import StateSolution
-from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, TIME
+from ..engine.data import ENDED, FULL, NFEV, NJEV, NLU, NOTHING, OK, PAUSE, REASON, ROW, START, TIME
 from ..engine.trust import ProjectionWarning
 from . import resume as _resume
 from .driver import Driver, expected_steps
+from .origin import Origin
 from .prepare import DEFAULT, RunArguments, identity, prepared, started_at
-from .results import IntegrationResult, Origin, described
+from .results import IntegrationResult, described
 
-__all__ = ["integrate"]
+__all__ = ["STOPPED", "integrate", "progress_bar", "used_up"]
 
 CHUNK_SECONDS = 0.2
 FIRST_CHUNK = 64
@@ -125,10 +127,11 @@ def integrate(
         For `EIPRadau` and `EIPBDF`, as for SciPy's Radau and BDF: ``jac(t, y[, params]) -> (n, n)``, the matrix of the
         derivatives of `fun`, dense or sparse, or a constant matrix.
     variations : str, int, sequence of these or array_like, shape (n, k), optional
-        Derivatives of the state that are integrated with it by a Runge-Kutta method, and projected so that they are
-        consistent with the invariants. ``"state"``: with respect to the initial state, the state-transition matrix
-        ``run.stm``. Names or indices of parameters: ``run.sensitivities``; a list combines several of these. An array:
-        columns with these initial values, ``run.variations``. Products with the Jacobian come from the problem, from
+        Derivatives of the state that are integrated with it by an explicit method, and projected, except by multistep
+        methods, so that they are consistent with the invariants. ``"state"``: with respect to the initial state, the
+        state-transition matrix ``run.stm``. Names or indices of parameters: ``run.sensitivities``; a list combines
+        several of these. An array: columns with these initial values, ``run.variations``. With events also
+        ``run.time_derivatives`` and ``run.state_derivatives``. Products with the Jacobian come from the problem, from
         dual numbers if the functions are jitted, from `jvp`, or else from complex steps. See
         :doc:`/how-to/tangent-maps`.
     jvp : callable, optional
@@ -249,7 +252,7 @@ class Loop:
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
         compiles = given.compiled is not False and is_jitted(problem.fun)
-        with _bar(given.progress and compiles, lambda: COMPILING):
+        with progress_bar(given.progress and compiles, lambda: COMPILING):
             functions, self.why_not = problem.functions(run, given.compiled)
             self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
@@ -257,6 +260,7 @@ class Loop:
             keeper.begin(self.driver, own, problem.derivative, self.events)
         self._chunk, self._seconds, self._begin = FIRST_CHUNK, 0.0, 0.0
         self._doubtful = self._event_ended = self._ended_early = False
+        self.remarks: list[str] = []  # on derivatives at events
         self._most_steps = UNBOUNDED if given.max_steps is None else given.max_steps
 
     def run(self) -> IntegrationResult:
@@ -264,7 +268,7 @@ class Loop:
         driver, keeper, result = self.driver, self.keeper, None
         self._begin = time.perf_counter() - (0.0 if keeper is None else keeper.seconds)
         try:
-            with _bar(self.given.progress, self._shown_by_bar) as bar:
+            with progress_bar(self.given.progress, self._shown_by_bar) as bar:
                 status, message = self.steps(bar)
             if keeper is not None:
                 keeper.end(status, message)
@@ -303,7 +307,7 @@ class Loop:
                 return 1, STOPPED
         while True:
             if driver.step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
-                return -1, f"max_steps={self._most_steps} steps were made, up to t={driver.now[0]:.10g}"
+                return -1, used_up(self._most_steps, driver.now[0])
             if self.keeper is not None:
                 self.keeper.keep()
             rows, steps, begin = driver.rows, self._next_steps(), time.perf_counter()
@@ -421,6 +425,7 @@ class Loop:
         if variations is not None:
             sol = None if sol is None else StateSolution(sol, run.tangents)
             asked = asked._replace(variations=run.tangents.restarted(y))
+        at_events, self.remarks = event_derivatives(run.problem, driver.schedule.span.t0, events.t, events.y)
         result = assembled(
             run,
             driver.y[: driver.rows],
@@ -440,14 +445,22 @@ class Loop:
             compiled=self.why_not is None,
             calls=run.problem.calls(run, driver.functions),
             h=abs(driver.schedule.span.h) or None,
+            **at_events,
         )
-        last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
+        last, at_end = (np.array([t]), y[None].copy()), not self._event_ended
         arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
         arguments |= arguments.pop("projection")
+        figures, rows = run.trust.figures, slice(driver.rows - 1, driver.rows)
+        saved = driver.rows > 0 and driver.t[rows] == t and np.array_equal(driver.y[rows], y[None])
         origin = Origin(
-            arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign,
-            lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
-            lambda: values_at(*last)[0], message, self._notes(),
+            arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign, tuple(run.invariants.names),
+            terms=np.where(np.isnan(target), np.inf, figures[:, START]),  # balances have no target
+            before=values[:, -1].copy() if saved else None,
+            event=events.last_index if self._event_ended else None,
+            kept=lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
+            values=lambda: driver.values_at(*last)[0],
+            derivative=lambda: run.tangents.state(run.problem.derivative(t, last[1][0])),
+            ended=message, notes=self._notes(),
         )  # fmt: skip
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
@@ -465,7 +478,7 @@ class Loop:
             notes.append(
                 f"the gradient of {names} is computed by differences: a function for it would be faster and exact"
             )
-        return tuple(str(note) for note in (*notes, run.conserved.missing) if note is not None)
+        return tuple(str(note) for note in (*notes, run.conserved.missing, *self.remarks) if note is not None)
 
 
 def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
@@ -485,6 +498,7 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
         nlu=int(counters[NLU]),
         method=run.name,
         component_names=run.problem.component_names,
+        restarts=[],
         units="" if problem is None else problem.units,
         epoch=None if problem is None else problem.epoch,
     )
@@ -494,7 +508,12 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
     return result
 
 
-def _bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
+def used_up(most_steps: int, t: float) -> str:
+    """Return the reason for the end of a run at t that has made `most_steps` steps, its option `max_steps`."""
+    return f"max_steps={most_steps} steps were made, up to t={t:.10g}"
+
+
+def progress_bar(shown: bool, options: Callable[[], dict[str, Any]]) -> Any:
     """Return a context manager that yields a progress bar with these options of tqdm, or None if it is not `shown`."""
     if not shown:
         return nullcontext()
@@ -513,7 +532,7 @@ def _attach_start(error: BaseException, request: RunArguments, seconds: float) -
             **dict.fromkeys(("nfev", "njev", "nlu"), 0),
             **dict.fromkeys(("success", "trusted", "compiled"), False),
             **{"t": np.array([t0]), "y": start[:, None], "invariants": nothing, "target": nothing[:, 0]},
-            **{"max_residual": nothing[:, 0], "diagnostics": Diagnostics(), "calls": {}, "units": ""},
+            **{"max_residual": nothing[:, 0], "diagnostics": Diagnostics(), "calls": {}, "units": "", "restarts": []},
             **{"status": -1, "message": f"interrupted by {type(error).__name__} at the start", "wall_time": seconds},
             method=getattr(request.method, "__name__", str(request.method)),
         )

@@ -42,7 +42,16 @@ from ..methods.implicit import Jacobian
 from .driver import check_bytes, check_memory, saved_rows
 from .resume import plain, settings
 
-__all__ = ["DEFAULT", "RunArguments", "as_problem", "default_method", "identity", "prepared", "started_at"]
+__all__ = [
+    "DEFAULT",
+    "RunArguments",
+    "as_problem",
+    "check_watching",
+    "default_method",
+    "identity",
+    "prepared",
+    "started_at",
+]
 
 
 class _Default:
@@ -262,7 +271,10 @@ def _variations(
     first = First(interval(_start(given, own)[0])[0], y0, extra)
     items = projection.invariants
     canonical, variational = (False, None) if own is None else (own.canonical, own.variational)
-    tangents = tangents.kept_symplectic(given.symplectic, canonical, bool(items))
+    reason = None if items else "without invariants no step is projected; give the energy, at least"
+    if solver.TABLEAU.has_history:
+        reason = "a multistep method projects no vectors; use EIPRKN12"
+    tangents = tangents.kept_symplectic(given.symplectic, canonical, reason)
     rhs, source = augmented_rhs(tangents, fun, form, first, given.jvp, variational)
     return Variations.of(tangents, rhs, source, first, items)
 
@@ -307,16 +319,21 @@ def _method(method: Any) -> Any:
 
 
 def _check_choices(request: RunArguments) -> None:
-    callback, compiled = request.callback, request.compiled
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
-    flag("progress", request.progress)
+    compiled = request.compiled
+    check_watching(request.callback, request.progress, request.max_steps)
     flag("dense_output", request.dense_output)
     if compiled is not None and not isinstance(compiled, (bool, np.bool_)):
         raise ValueError(f"compiled must be True, False or None (compile if possible), got {shown(compiled)}.")
     check_bytes(request.max_bytes)
-    if request.max_steps is not None:
-        count("max_steps", request.max_steps)
+
+
+def check_watching(callback: Any, progress: Any, max_steps: Any) -> None:
+    """Check the options `callback`, `progress` and `max_steps`."""
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback must be a function callback(t, y, residuals), got {shown(callback)}.")
+    flag("progress", progress)
+    if max_steps is not None:
+        count("max_steps", max_steps)
 
 
 def _schedule(span: Span, tau: float, request: RunArguments, events: Events) -> Schedule:

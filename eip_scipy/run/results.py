@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.integrate import OdeSolution
@@ -13,25 +13,16 @@ from scipy.optimize import OptimizeResult
 
 from .. import checkpoint
 from ..checkpoint import CheckpointError, decoded, encoded
+from ..core.event_derivatives import EVENT_DERIVATIVES
 from ..core.inputs import shown
 from ..core.problem import Problem, component_names
 from ..core.results import Diagnostics, Multipliers
 from . import fields
+from .fields import OBSERVED
+from .origin import restored, stored
+from .prepare import DEFAULT
 
-__all__ = ["Fields", "IntegrationResult", "Origin", "Result", "described", "load", "plot", "save", "steps"]
-
-
-class Origin(NamedTuple):
-    """Origin of a result, from which its run can be continued."""
-
-    arguments: dict[str, Any]  # the keyword arguments of `integrate`
-    t: float  # time of the last state
-    y: np.ndarray  # (n,): last state of the run, saved or not
-    sign: float  # direction of time, 1 or -1
-    kept: Callable[[], Any]  # returns the invariants of the run, with the kept values as their targets
-    values: Callable[[], np.ndarray]  # returns the invariants (l,) in the last state, as their functions are now
-    ended: str  # reason for the end of the run
-    notes: tuple[str, ...]  # remarks at the end of its message
+__all__ = ["Fields", "IntegrationResult", "Result", "described", "load", "plot", "save", "steps"]
 
 
 def described(ended: str, diagnostics: Diagnostics, notes: Sequence[str]) -> str:
@@ -83,7 +74,10 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
         result._observe()
     arrays: dict[str, np.ndarray] = {}
     found = {name: None if callable(value) else encoded(name, value, arrays) for name, value in result.items()}
-    checkpoint.write(path, {"kind": KIND, "class": type(result).__name__, "fields": found}, arrays)
+    header = {"kind": KIND, "class": type(result).__name__, "fields": found}
+    if (origin := vars(result).get("_origin")) is not None:
+        header["origin"] = stored(origin, arrays)
+    checkpoint.write(path, header, arrays)
 
 
 def load(path: str | os.PathLike[str]) -> Any:
@@ -96,8 +90,8 @@ def load(path: str | os.PathLike[str]) -> Any:
     Returns
     -------
     IntegrationResult or EnsembleResult
-        The saved result without functions: ``sol`` is None, and `IntegrationResult.continue_to` raises an error that
-        says how to continue. A result of `solve_ivp` is returned as `scipy.optimize.OptimizeResult`, its base class.
+        The saved result without functions: ``sol`` is None, and `IntegrationResult.continue_to` needs those of the run
+        again. A result of `solve_ivp` is returned as `scipy.optimize.OptimizeResult`, its base class.
 
     Raises
     ------
@@ -120,7 +114,9 @@ def load(path: str | os.PathLike[str]) -> Any:
     if header["class"] not in CLASSES:
         return OptimizeResult(found)
     # Imported by name, because ensembles are built on runs.
-    return getattr(import_module("..results", __package__), header["class"])(found)
+    result = getattr(import_module("..results", __package__), header["class"])(found)
+    object.__setattr__(result, "_origin", restored(header.get("origin"), arrays))
+    return result
 
 
 def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any = None) -> Any:
@@ -181,11 +177,11 @@ ABSENT = {
     "stm": 'this run has no state-transition matrix; ask for it with variations="state".',
     "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
     "variations": "this run carried no derivatives; ask for them with variations=...",
+    **dict.fromkeys(EVENT_DERIVATIVES, "this run has no derivatives at events; give it variations=... and events=..."),
     "multipliers": "this result has no multipliers: its problem is not a mechanical system with constraints.",
     "outputs": "this result has no outputs; give outputs={name: ...} to `mechanism` or `mechanics`.",
 }
-OBSERVED = ("outputs", "multipliers")  # computed when they are first requested
-UNSET = ("units", "epoch")  # fields that are printed only if they are set
+UNSET = ("units", "epoch", "restarts")  # fields that are printed only if they are set
 
 
 class Result(Fields):
@@ -318,11 +314,22 @@ class IntegrationResult(Result):
     variations : ndarray, shape (m, n, k)
         Columns of derivatives at the saved times, if they were requested. Between two steps they are interpolated
         and projected, as the states are. See `stm` and `sensitivities`.
+    tangent_events : list of ndarray, shape (m, n, k)
+        For each event of a run with derivatives, the columns at the m times at which it happened.
+    time_derivatives : list of ndarray, shape (m, k)
+        Derivatives of these times, along the same columns: -(grad g Phi + dg/dp) / (dg/dt + grad g f) for an event g.
+        They are NaN, and `message` says so, if the state only grazes the event, so that its rate vanishes there.
+    state_derivatives : list of ndarray, shape (m, n, k)
+        Derivatives of the states at the event, whose times shift: ``tangent_events`` plus f times ``time_derivatives``.
     columns : dict
         Description of the columns of `variations`: "state", True if the state-transition matrix is included;
         "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
         "symplectic", True if the matrix was kept symplectic; "source", the origin of the products with the Jacobian:
         "problem", "jvp", "dual numbers" or "complex steps".
+    restarts : list of (float, str)
+        Times at which `continue_to` has restarted the run with a change, and the names of what was given: "y, params".
+    targets : ndarray, shape (l, m)
+        If restarts have changed targets, or the invariants: the targets at the saved times. `target` has the last ones.
     units : str
         Units of the `Problem`; "" without one.
     epoch : (float, float) or None
@@ -336,8 +343,9 @@ class IntegrationResult(Result):
     Notes
     -----
     The result can be pickled. A result that was pickled or loaded does not know the functions of its run: `continue_to`
-    raises an error. In a pickled result ``sol`` has the same states at the steps, but those in between are not
-    projected, because that needs the functions; in a loaded result it is None.
+    of a loaded one takes them, and raises an error for one that was pickled. In a pickled result ``sol`` has the same
+    states at the steps, but those in between are not projected, because that needs the functions; in a loaded result it
+    is None.
     """
 
     invariants: np.ndarray
@@ -363,46 +371,91 @@ class IntegrationResult(Result):
     epoch: tuple[float, float] | None
     outputs: dict[str, np.ndarray]
     multipliers: Multipliers
+    restarts: list[tuple[float, str]]
+    tangent_events: list[np.ndarray]
+    time_derivatives: list[np.ndarray]
+    state_derivatives: list[np.ndarray]
 
     plot = plot
 
-    def continue_to(self, t: float, **options: Any) -> IntegrationResult:
-        """Continue from the last state to a later time, with the functions and options of the run.
+    def continue_to(
+        self,
+        t: float,
+        *,
+        y: Any = None,
+        jacobian: Any = None,
+        params: Any = None,
+        fun: Any = None,
+        acceleration: Any = None,
+        invariants: Any = None,
+        events: Any = DEFAULT,
+        h: float | None = DEFAULT,
+        rtol: Any = DEFAULT,
+        atol: Any = DEFAULT,
+        save_every: int | None = DEFAULT,
+        t_eval: Any = DEFAULT,
+        **options: Any,
+    ) -> IntegrationResult:
+        """Continue from the last state to a later time, as before or with a change of the state or the equations.
 
         Parameters
         ----------
         t : float
             New end of the run, beyond the present one in its direction.
+        y : array_like, shape (n,), or callable, optional
+            The state from which the run continues, or a function ``y(state) -> (n,)`` of the last state: a kick or a
+            bounce.
+        jacobian : array_like, shape (n, n) or (n, n + p), or callable, optional
+            Derivative of the new state with respect to the old one, and to the p parameters whose derivatives the run
+            carries, or a function of the last state that returns it. Needed with `y` in a run with ``variations=``.
+        params : array_like or mapping, optional
+            New parameters; those that a mapping does not name keep their values.
+        fun, acceleration : callable or Problem, optional
+            New equations, as for `integrate`. For a loaded run, the equations that it had.
+        invariants : optional
+            New invariants. Default: those of the run; of a `Problem` that is given as `fun`; none if `fun` replaces a
+            Problem by a function. For a loaded run, the invariants that it had.
+        events : callable or sequence of callable, optional
+            New events, which start to count at 0 and may happen at once; `t_events` and `y_events` are then those of
+            the second run only. None removes all. By default the events keep their counts: one with ``terminal = 3``
+            that happened twice before ends the run when it happens once more, and one that ended the run ends it again
+            when it happens next.
+        h, rtol, atol, save_every, t_eval : optional
+            As for `integrate`. `t_eval` is not repeated: without new times the states at both ends are saved.
         **options
-            Options of `integrate` that change: method, h, rtol, atol, first_step, max_step, save_every, t_eval, events,
-            callback, progress, compiled, max_bytes, checkpoint, checkpoint_every, resume, check and project_initial.
-            `t_eval` is not repeated: without new times the states at both ends are saved. Events keep their counts: one
-            with ``terminal = 3`` that happened twice before ends the run when it happens once more, and one that ended
-            the run ends it again when it happens next; ``events=None`` removes all. New events start to count at 0, and
-            may happen at once; `t_events` and `y_events` are then those of the second run only.
+            Other options of `integrate` that may change: method, first_step, max_step, max_steps, callback, progress,
+            compiled, max_bytes, checkpoint, checkpoint_every, resume, check and project_initial.
 
         Returns
         -------
         IntegrationResult
             Both runs combined: rows, events and interpolants in order, counts and seconds added, invariant errors and
             corrections the larger of both, `trusted` if both are, with the reasons of both in `message`; status,
-            method and h are those of the second run. Fields that were added to the first result are left out.
+            method and h are those of the second run. `restarts` lists what was given. Fields that were added to the
+            first result are left out. Its rows may share memory with those of this result.
 
         Raises
         ------
         ValueError
-            If another option of `integrate` is given, because a value of the first part belongs to it, such as the
-            targets of the invariants to `params`; if something that an invariant uses has changed, so that it has
-            another value in the last state; if `t` is not beyond the end; if the result was loaded, unpickled or
-            copied; or if the last state misses a given target by more than 1e-8 of the terms of the invariant, as after
-            an unreliable run or one without checks: ``project_initial=True`` then projects the state first.
+            If another option of `integrate` is given; if something that an invariant uses has changed, so that it has
+            another value in the last state; if `t` is not beyond the end; if functions given to a loaded run have other
+            values in its last state than those that it had; if `jacobian` is missing or wrong; if the result was
+            unpickled or copied; or if the state misses a given target by more than 1e-8 of the terms of the invariant,
+            as after an unreliable run or one without checks: ``project_initial=True`` then projects the state first.
 
         Notes
         -----
-        The second run agrees bit by bit with an `integrate` from the last state, except that each invariant keeps the
-        value of the first start, so that errors do not add up. It agrees only to rounding with an uninterrupted run:
-        `save_every`, the first step of adaptive steps, compensated sums and the history of multistep methods start
-        again. Use a checkpoint (``checkpoint=``, ``resume=True``) for the same bits.
+        Without a change the second run agrees bit by bit with an `integrate` from the last state, except that each
+        invariant keeps the value of the first start, so that errors do not add up. It agrees only to rounding with an
+        uninterrupted run: `save_every`, the first step of adaptive steps, compensated sums and the history of multistep
+        methods start again. Use a checkpoint (``checkpoint=``, ``resume=True``) for the same bits.
+
+        With a change of `y`, `params`, `fun`, `acceleration` or `invariants` the states before and after it are saved
+        both. An invariant keeps its value if the change leaves it, and otherwise takes the new value as its target,
+        unless the user has given a target. Tangent vectors pass through the change: by its Jacobian J at a fixed
+        time, and as J S - f dt at an event that ended the run, where f is the new derivative, dt the `time_derivatives`
+        and S the `state_derivatives` of the event. They are not kept symplectic afterwards. Derivatives with respect to
+        a parameter that changes are those for a shift by the same amount in all parts.
 
         Examples
         --------
@@ -412,9 +465,16 @@ class IntegrationResult(Result):
         >>> longer = run.continue_to(20)
         >>> float(longer.t[-1]), bool((longer.max_residual < 1e-11).all())
         (20.0, True)
+        >>> kicked = longer.continue_to(30, y=lambda y: y * [1, 1, 1.01, 1.01])
+        >>> kicked.restarts
+        [(20.0, 'y')]
         """
         from .continuation import continue_to
 
+        given = {"events": events, "h": h, "rtol": rtol, "atol": atol, "save_every": save_every, "t_eval": t_eval}
+        changes = {"y": y, "jacobian": jacobian, "params": params, "fun": fun, "acceleration": acceleration}
+        options |= {name: value for name, value in given.items() if value is not DEFAULT}
+        options |= {name: value for name, value in (changes | {"invariants": invariants}).items() if value is not None}
         return continue_to(self, t, options)
 
     def __repr__(self) -> str:

@@ -31,6 +31,7 @@ from ..core.solvers import (
 from ..core.step_control import interval
 from ..core.tangent_vectors import StateSolution, TangentVectors, tangent_vectors
 from ..core.variations import Variations, augmented_rhs
+from .watch import Watch
 
 if TYPE_CHECKING:
     Result = dict[str, Any]
@@ -118,6 +119,9 @@ def solve_ivp(
     lband: int | None = None,
     uband: int | None = None,
     min_step: float | None = None,
+    callback: Callable[[float, np.ndarray, np.ndarray], Any] | None = None,
+    progress: bool = False,
+    max_steps: int | None = None,
     **projection: Unpack[ProjectionKeywords],
 ) -> OdeResult:
     """Solve an initial value problem with `scipy.integrate.solve_ivp`, and report whether the run is reliable.
@@ -165,6 +169,13 @@ def solve_ivp(
         The Jacobian, for `EIPRadau`, `EIPBDF` and SciPy's implicit methods, see `scipy.integrate.Radau`.
     lband, uband, min_step : optional
         Options of SciPy's LSODA.
+    callback : callable, optional
+        ``callback(t, y, residuals)``, called at each saved point with the invariant errors `residuals` (none with a
+        method of SciPy); return True to stop the run with status 1. Points at `t_eval` are reported after their step.
+    progress : bool, optional
+        Show a progress bar with the remaining time.
+    max_steps : int, optional
+        Largest number of steps; a run that needs more ends with status -1, and keeps what it has.
 
     Returns
     -------
@@ -206,18 +217,27 @@ def solve_ivp(
         options["invariants"] = kept
     function = _right_hand_side(fun, acceleration, t_span, y0)
     args, extra = _unpacked(args)
-    common = {"t_eval": t_eval, "dense_output": dense_output, "vectorized": vectorized, "args": args}
+    watch = Watch(callback, progress, max_steps)
+    common: dict[str, Any] = {"t_eval": t_eval, "dense_output": dense_output, "vectorized": vectorized, "args": args}
     method = _with_projection(method, [name for name in options if name in OWN])
     if isinstance(method, type) and issubclass(method, EIPSolver):
-        return _solve(method, function, t_span, y0, extra, events, common, options)
+        return _solve(watch, method, function, t_span, y0, extra, events, common, options)
     if events is not None:
         common["events"] = Events(events, extra).for_scipy(None, as_scipy=True)
-    sol = scipy.integrate.solve_ivp(function, t_span, y0, method=method, **common, **options)
+    sol = watch.run(function, t_span, y0, method, **common, **options)
     return OdeResult(sol, trusted=bool(sol.success), diagnostics=Diagnostics())
 
 
 def _solve(
-    method: type[EIPSolver], fun: Any, t_span: Any, y0: Any, extra: tuple, events: Any, common: Any, options: Any
+    watch: Watch,
+    method: type[EIPSolver],
+    fun: Any,
+    t_span: Any,
+    y0: Any,
+    extra: tuple,
+    events: Any,
+    common: Any,
+    options: Any,
 ) -> OdeResult:
     """Return the result of a run with an EIP method; `common` has the options of SciPy's solve_ivp itself."""
     start, solvers = initial_state(y0), list[Any]()
@@ -242,7 +262,8 @@ def _solve(
         begun = lambda t, y: (solvers[0].f, solvers[0].direction * float(solvers[0].h or solvers[0].h_abs))  # noqa: E731
         common["events"] = Events(events, extra).for_scipy(begun, as_scipy=method._takes_scipys_steps(options))
     options |= {"invariants": items, "_context": Context(start, solvers, augmented)}
-    sol = scipy.integrate.solve_ivp(fun, t_span, start, method=method, **common, **options)
+    common["tangents"] = None if augmented is None else augmented.tangents
+    sol = watch.run(fun, t_span, start, method, **common, **options)
     if augmented is not None:
         _split(sol, augmented.tangents)
     if sol.status == 1:  # SciPy does not inform the solver that its run has ended

@@ -145,6 +145,13 @@ def test_a_run_has_outputs_and_multipliers(released, swing, tmp_path):
     longer = swing.continue_to(3.0)
     assert longer.outputs["height"].shape == longer.t.shape == longer.multipliers.rank.shape
     np.testing.assert_array_equal(longer.outputs["height"], longer.y[1])
+    cut = swing.continue_to(3.0, fun=lambda t, y: np.array([*y[2:], 0, -G]))  # the string, whose force ends there
+    first = np.arange(cut.t.size) < swing.t.size
+    np.testing.assert_array_equal(np.isnan(cut.outputs["height"]), ~first)
+    np.testing.assert_array_equal(cut.multipliers.values[:, first], swing.multipliers.values)
+    np.testing.assert_array_equal(cut.multipliers.rank, first)
+    assert cut.y[1, -1] == pytest.approx(swing.y[1, -1] + swing.y[3, -1] - G / 2)
+    assert {"height", "multiplier g1'"} < set(cut.to_dataframe().columns)
     for again in (load(tmp_path / "run.npz"), pickle.loads(pickle.dumps(swing))):
         np.testing.assert_array_equal(again.outputs["energy"], swing.outputs["energy"])
         np.testing.assert_array_equal(again.multipliers.values, swing.multipliers.values)

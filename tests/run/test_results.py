@@ -345,7 +345,7 @@ def test_what_cannot_be_continued():
         ({"t": 6.0, "y0": [1.0]}, TypeError, "y0 cannot be changed"),
         ({"t": 6.0, "mehtod": EIPRK4}, TypeError, "no option 'mehtod'"),
     ]
-    for name in ("params", "args", "variations", "jvp", "metric", "every", "dense_output", "linear_invariants"):
+    for name in ("args", "variations", "jvp", "metric", "every", "dense_output", "linear_invariants"):
         rows.append(({"t": 6.0, name: [1.1]}, ValueError, f"{name} cannot be changed"))
     refuse(kepler_run().continue_to, rows)
 

@@ -309,3 +309,43 @@ def test_the_signature_is_scipys_with_the_options():
     assert {"invariants", "h", "metric", "blocks", "every", "iterations", "linear_invariants", "diagnostics"} < set(
         shown
     )
+
+
+@pytest.mark.parametrize("method", [EIPRK45, EIPRKN12, "DOP853", "BDF", "LSODA"])
+@pytest.mark.parametrize("saved", [{}, {"t_eval": [0, 2, 4, 4.01, 9]}, {"dense_output": True}])
+def test_a_callback_stops_the_run_and_gets_each_saved_point(method, saved, capsys):
+    """The points are those of the run without it, up to the one where it returns True."""
+    points = []
+
+    def stop(t, y, residuals):
+        points.append((t, *y))
+        assert (abs(residuals) < 1e-13).all()
+        return t >= 4
+
+    options = {"method": method, "args": (K,), "rtol": 1e-6, **saved}
+    options |= {} if isinstance(method, str) else {"invariants": ENERGY}
+    whole = solve_ivp(spring, (0, 9), [1.0, 0.0], **options)
+    sol = solve_ivp(spring, (0, 9), [1.0, 0.0], **options, callback=stop, progress=True, max_steps=10**6)
+    assert (sol.status, sol.success, sol.message) == (1, True, "stopped by the callback")
+    np.testing.assert_array_equal(sol.t, whole.t[: sol.t.size])
+    np.testing.assert_array_equal(sol.y, whole.y[:, : sol.t.size])
+    np.testing.assert_array_equal(np.array(points).T, [sol.t, *sol.y])
+    assert sol.t[-2] < 4 <= sol.t[-1]
+    assert "/9.00" in capsys.readouterr().err
+    if "dense_output" in saved:
+        np.testing.assert_array_equal(sol.sol(sol.t[:-1]), whole.sol(sol.t[:-1]))
+    few = solve_ivp(spring, (0, 9), [1.0, 0.0], **options, max_steps=3)
+    assert (few.status, few.success, few.trusted) == (-1, False, False)
+    assert "max_steps=3 steps were made, up to t=" in few.message
+
+
+def test_a_callback_gets_the_event_that_ends_the_run():
+    points = []
+    sol = solve_ivp(spring, (0, 9), [1.0, 0.0], args=(K,), events=second_fall, variations="state",
+                    callback=lambda t, y, residuals: points.append((t, *y)))  # fmt: skip
+    np.testing.assert_array_equal(np.array(points).T, [sol.t, *sol.y])
+    assert sol.t[-1] == sol.t_events[0][-1]
+    given = {"fun": spring, "t_span": (0, 1), "y0": [1.0, 0.0], "args": (K,)}
+    wrong = [({"callback": 3}, TypeError, "callback must be"), ({"progress": "x"}, ValueError, "progress"),
+             ({"max_steps": 0}, ValueError, "max_steps")]  # fmt: skip
+    refuse(solve_ivp, [(given | options, *rest) for options, *rest in wrong])
