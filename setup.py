@@ -23,7 +23,7 @@ from building.targets import target
 FOLDER = Path("eip_scipy/engine/cpp")
 # Called once a run, or by Python: these are compiled in half the time without the passes that make loops fast.
 COLD = ["complex_step.cpp", "examination.cpp", "library.cpp", "module.cpp", "python_functions.cpp"]
-COLD += ["records.cpp"]
+COLD += ["records.cpp", "states.cpp"]
 # These files do not include Python's headers, so that zig, which keeps what it has compiled, compiles them once.
 NUMBERS = ["engine.cpp", "forces.cpp", "gravity.cpp", "kepler.cpp", "orbits.cpp", "planets.cpp", "threads.cpp"]
 # The library of nanobind is compiled once and linked into both modules: what differs between these, the NB_DOMAIN that

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import copy
-import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..engine.native import LibraryFunction, NativeFunctions, PythonFunctions, call
+from ..engine.native import BUILD, LibraryFunction, NativeFunctions, PythonFunctions, call
 from ..methods.base import Method
 from ..methods.gauss_jackson import jacobian_product
 from ..methods.implicit import Jacobian
 from ..methods.nystrom import check_halves
 from .events import Events
-from .functions import BY_NAME, NotCompilableError, PointerFunction, compiled_calls, floats, names, native_functions
+from .functions import (
+    BY_NAME,
+    Kind,
+    NotCompilableError,
+    PointerFunction,
+    by_address,
+    floats,
+    jit_is_off,
+    names,
+    native_functions,
+    scalars,
+)
 from .inputs import as_vector, filled, numbers, require_arguments, shown
 from .problem import Problem, made
 from .tangent_vectors import NO_TANGENT_VECTORS
@@ -33,7 +42,7 @@ FORMS = {  # (given as an acceleration, in place) -> name of the form of the use
     (True, False): "acceleration",
     (True, True): "acceleration in place",
 }
-NO_JACOBIAN = Jacobian()
+NO_EVENTS, NO_JACOBIAN = Events(None), Jacobian()
 CALLED = "It takes (t, y), then out if in_place=True, then the arguments from params=... or args=(...)."
 CALLED_ACCELERATION = (
     "It takes (t, q), then out if in_place=True, then the arguments from params=... or args=(...). If accelerations "
@@ -48,7 +57,9 @@ class BoundProblem:
     `acc` is the acceleration of a problem that has one, if the method needs nothing else, ``jacobian(t, q, dq, out,
     *extra)`` is for multistep methods, and `jac` for implicit ones. `variations` are the functions of an augmented
     state, `tangents` the vectors in it, and `n` is the number of components without them. A `vectorized` function takes
-    states (n, 1). With `explains`, errors name the arguments of a call that fails.
+    states (n, 1). With `explains`, errors name the arguments of a call that fails. With `by_address`, Numba functions
+    are called as C functions also outside of the steps. `kind` has the arguments of compiled functions, if there are
+    such; `called_kind` is None unless `by_address`. ``evaluate(t, y)`` returns the derivative, and does not count.
     """
 
     def __init__(
@@ -66,9 +77,10 @@ class BoundProblem:
         variations: Variations | None = None,
         vectorized: bool = False,
         explains: bool = False,
+        by_address: bool = False,
     ) -> None:
         self.y0, self.form, self.extra, self.problem = y0, form, extra, problem
-        self.events = Events(None) if events is None else events
+        self.events = NO_EVENTS if events is None else events
         self.acc, self.jacobian, self.jac, self.variations = acc, jacobian, jac, variations
         self.tangents = NO_TANGENT_VECTORS if variations is None else variations.tangents
         self.n = self.tangents.state(y0).size
@@ -79,6 +91,9 @@ class BoundProblem:
         # Accelerations may depend on velocities if they come from a function that is called with these.
         self.sees_velocity = not self.second_order and (problem is None or problem.acc is None)
         self.count = 0  # of the calls of `derivative`
+        types, p = scalars(extra), self.parameters.size if extra else -1
+        self.kind = None if types is None else Kind((), y0.size, p, y0.dtype.char, scalars=types)
+        self.called_kind = self.kind if by_address and not jit_is_off() else None
         self.bind(fun)
         if jacobian is not None and not callable(jacobian):
             raise TypeError(f"jacobian must be a function jacobian(t, q, dq, out[, params]), got {shown(jacobian)}.")
@@ -91,36 +106,50 @@ class BoundProblem:
         if own and fun.__name__.partition(".")[0] == acc.__name__.partition(".")[0]:
             self.native_form = acc, "acceleration"
         self.is_second_order = self.native_form[1].startswith("acceleration")  # (v, a) by its construction
-        called, half = _flat(fun, self.y0.size) if self.vectorized else fun, 0
+        n, dtype, name = self.y0.size, self.y0.dtype, self.name
         if self.second_order:
-            check_halves(self.y0.size)
-            half = self.y0.size // 2
-        evaluate = (_filled if self._in_place else _checked)(called, self.extra, self.y0[: half or None], self.name)
-        self.evaluate = evaluate
-        if self.second_order:
-            self.evaluate = lambda t, y: np.concatenate([y[half:], evaluate(t, y[:half])])
+            check_halves(n)
+        size = n // 2 if self.second_order else n
+
+        def convert(f: Any, t: float) -> Array:
+            return np.array(as_vector(f, size, dtype, f"{name} returned", t), dtype, order="C")
+
+        called = _flat(fun, n) if self.vectorized else fun
+        found = call(called, self.extra, (size,), convert, in_place=self._in_place)
+        self.call = by_address(found, name, self.called_kind, self.parameters, size)
+        self._is_filled = not self._in_place or isinstance(fun, LibraryFunction)  # once that is checked
+        self.evaluate = BUILD.RightHandSide(self.call, n, dtype.kind == "c", self.second_order)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "evaluate"}
+        return {name: value for name, value in vars(self).items() if name not in ("evaluate", "call")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self.bind(self.fun)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> BoundProblem:
-        return copy.copy(self)  # with the same functions
+        new = object.__new__(BoundProblem)
+        new.__setstate__(self.__getstate__())  # with the same functions
+        return new
 
     def derivative(self, t: float, y: Array) -> Array:
         """Return the derivative (n,) at (t, y) as a new array, and count the call."""
         self.count += 1
         try:
-            return self.evaluate(t, y).copy()  # the value may be a buffer that the user's function fills again
+            return self.evaluate(t, y) if self._is_filled else self._filled(t, y)
         except TypeError:
             if self._explains:
                 third = ("out",) if self._in_place else ()
                 state, advice = ("q", CALLED_ACCELERATION) if self.second_order else ("y", CALLED)
                 require_arguments(self.fun, ("t", state, *third, *names(self.extra)), self.name, advice)
             raise
+
+    def _filled(self, t: float, y: Array) -> Array:
+        """Return the derivative by a user's in-place function, after a check that it fills its argument out."""
+        self._is_filled, half = True, y.size // 2 if self.second_order else 0
+        q = y[: half or None]
+        f = filled(lambda out: self.fun(t, q.copy(), out, *self.extra), q.shape, y.dtype, self.name, t)
+        return np.concatenate([y[half:], f]) if half else f
 
     @property
     def left_out(self) -> str:
@@ -196,25 +225,14 @@ class BoundProblem:
             functions += [item.function, item.gradient, item.rate_function]
         return [function for function in functions if isinstance(function, PointerFunction)]
 
-    def in_python(self, run: Run, *, by_address: bool = False) -> PythonFunctions:
-        """Return all functions as Python calls them, or `by_address` jitted ones that compile."""
-        n, dtype = self.y0.size, self.y0.dtype
-        size = n // 2 if self.second_order else n
-        fun = _flat(self.fun, n) if self.vectorized else self.fun
-
-        def convert(f: Any, t: float) -> Array:
-            return np.array(as_vector(f, size, dtype, f"{self.name} returned", t), dtype, order="C")
-
-        rhs = call(fun, self.extra, (size,), convert, in_place=self._in_place)
-        jacobian = None
+    def in_python(self, run: Run) -> PythonFunctions:
+        """Return all functions as Python calls them."""
+        jacobian, half = None, (self.y0.size // 2,)
         if run.uses_jacobian:
-            jacobian = call(self.jacobian, self.extra, (n // 2,), convert, in_place=True, takes_f=True)
-        inv, grad = run.invariants.calls
-        if by_address:
-            rhs, *both = compiled_calls((rhs, *inv, *grad), n, dtype)
-            inv, grad = tuple(both[: len(inv)]), tuple(both[len(inv) :])
+            jacobian = call(self.jacobian, self.extra, half, self.call.convert, in_place=True, takes_f=True)
         rates = run.invariants.rates(run.options.adaptive)
-        return PythonFunctions(rhs, inv, grad, self.events.calls, self.second_order, jacobian, rates)
+        inv, grad = run.invariants.calls
+        return PythonFunctions(self.call, inv, grad, self.events.calls, self.second_order, jacobian, rates)
 
     def calls(self, run: Run, functions: PythonFunctions | NativeFunctions) -> dict[str, str]:
         """Return how each function is called, as the attribute `calls` of `IntegrationResult`."""
@@ -240,39 +258,6 @@ class BoundProblem:
             called["jacobian"] = self.jacobian
         found = {name: kind(fun, in_python) for name, fun in called.items()}
         return found | {f"event {k}": kind(event, events_in_python) for k, event in enumerate(self.events.functions)}
-
-
-def _checked(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Callable[[float, Array], Array]:
-    """Return `fun` with checks of its values, which may be buffers of the user; it gets copies of the state."""
-    n, dtype, shape = y0.size, y0.dtype, y0.shape
-
-    def evaluate(t: float, y: Array) -> Array:
-        f = fun(t, y.copy(), *extra)
-        if type(f) is np.ndarray and f.shape == shape and f.dtype is dtype:
-            return f
-        return np.array(as_vector(f, n, dtype, f"{name} returned", t), dtype, order="C")
-
-    return evaluate
-
-
-def _filled(fun: Callable[..., Any], extra: tuple, y0: Array, name: str) -> Callable[[float, Array], Array]:
-    """Return the value of an in-place function, whose first call is checked unless it is one of this package.
-
-    `out` is filled with NaN before each call: the first call raises an error if the function leaves components
-    unfilled, and later ones leave NaN there.
-    """
-    shape, dtype, is_checked = y0.shape, y0.dtype, isinstance(fun, LibraryFunction)
-
-    def evaluate(t: float, y: Array) -> Array:
-        nonlocal is_checked
-        if not is_checked:
-            is_checked = True
-            return filled(lambda out: fun(t, y.copy(), out, *extra), shape, dtype, name, t)
-        out = np.full(shape, math.nan, dtype)
-        fun(t, y.copy(), out, *extra)
-        return out
-
-    return evaluate
 
 
 def _flat(fun: Callable[..., Any], n: int) -> Callable[..., Any]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dgeqp3
 
-from ..engine.native import LibraryFunction
+from ..engine.native import BUILD, LibraryFunction
 from ..methods.base import PROJECTION_ONLY
-from .derivatives import time_of_motion, typical_sizes, unless_error
+from .derivatives import NumericalGradient, time_of_motion, typical_sizes, unless_error
 from .particles import LinearInvariants, particle_invariants
 
 if TYPE_CHECKING:
@@ -77,15 +77,18 @@ class Conserved(NamedTuple):
     @property
     def rows_from_f(self) -> list[int]:
         """Return the indices of the values whose gradients are made of f."""
-        return np.flatnonzero(np.isfinite(self.masses[:, :1])).tolist()
+        return np.flatnonzero(np.isfinite(self.masses[:, :1])).tolist() if self.masses.size else []
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return sentences for `Diagnostics`."""
+        missing = () if self.missing is None else (str(self.missing),)
+        if not self.found:
+            return missing
         kept = len(self.linear.C)
         rest = "" if kept == self.found else "; the given invariants determine the others"
         text = f"linear invariants: {self.found} found by {self.calls} evaluations (not in nfev), {kept} kept{rest}"
-        return (text,) * bool(self.found) + (() if self.missing is None else (str(self.missing),))
+        return (text, *missing)
 
 
 NOTHING = Conserved()
@@ -113,23 +116,23 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
         and not (n > MOST_COMPONENTS and invariants.by_values.any())  # gradients by differences take long
         and not all(isinstance(item.function, LibraryFunction) for item in invariants.items)
     )  # fmt: skip
-    rows: Array = np.zeros(0, int)
+    rows = []
     if n % 2 == 0 and not (run.tangents.count or method.in_python):
-        alone = invariants.of_values(np.diff(invariants.starts) == 1)  # an item is evaluated as a whole
-        rows = np.flatnonzero(
-            alone & (~invariants.of_values(invariants.given_gradients) if n > FEW else invariants.by_numbers)
+        own = (
+            invariants.given_gradients if n > FEW else [not isinstance(g, NumericalGradient) for g in invariants.grads]
         )
-    if not (is_searched or known or names or len(rows)):
+        of_items = zip(pairwise(invariants.starts), own, strict=True)  # an item is evaluated as a whole
+        rows = [first for (first, end), is_exact in of_items if end == first + 1 and not is_exact]
+    if not (is_searched or known or names or rows):
         return NOTHING
     samples = _Samples(run, y, f, is_searched)
     with np.errstate(all="ignore"):
         found = unless_error(_found, samples, known, names) or NOTHING
-        masses = unless_error(_masses_from_f, samples, rows) if len(rows) else None
-    run.problem.count -= samples.calls
+        masses = unless_error(_masses_from_f, samples, rows) if rows else None
     return found._replace(calls=samples.calls, masses=NOTHING.masses if masses is None else masses)
 
 
-def _masses_from_f(samples: _Samples, rows: Array) -> Array | None:
+def _masses_from_f(samples: _Samples, rows: list[int]) -> Array | None:
     """Return `Conserved.masses` for gradients with the indices `rows`; None if none of them is made of f.
 
     For q'' = a(t, q) and H = T + V, and for canonical (q, p), the gradient of the energy has the components of f, up to
@@ -171,7 +174,7 @@ class _Samples:
 
     The first ones are near the start, at its time; if `is_wide`, there are others at larger distances, at times up to
     the end. Of a state with tangent vectors only the state itself, `y` at the start, is varied. `calls` counts the
-    evaluations of the right-hand side.
+    evaluations of the right-hand side, which the problem does not count.
     """
 
     def __init__(self, run: Run, y: Array, f: Array, is_wide: bool) -> None:
@@ -187,16 +190,14 @@ class _Samples:
     def points(self) -> tuple[Array, Array]:
         """Return states (m, n) and derivatives, which are NaN where the function fails."""
         near, far = (max(self.y.size, NEAR), FAR) if self.is_wide else (NEAR, 0)
-        y = states_near(self.y, self.sizes, near * [NEAR_DISTANCE] + far * [FAR_DISTANCE])
-        f = np.full_like(y, np.nan)
+        y = states_near(self.y, self.sizes, near * (NEAR_DISTANCE,) + far * (FAR_DISTANCE,))
         t0, t_bound = self.run.invariants.t_span
         span = t_bound - t0 if np.isfinite(t_bound) else 0.0
         self.calls += near + far
-        rhs = self.run.tangents.of_state(self.run.problem.derivative, self.run.begin.y)
-        for k, t in enumerate([t0] * near + [t0 + span * k / (FAR - 1) for k in range(far)]):
-            if (found := unless_error(rhs, t, y[k])) is not None:
-                f[k] = found
-        return y, f
+        times = np.array([t0] * near + [t0 + span * k / (FAR - 1) for k in range(far)])
+        start, tangents = self.run.begin.y, self.run.tangents
+        states = np.array([tangents.with_state(start, state) for state in y]) if tangents.count else y
+        return y, tangents.state(self.run.problem.evaluate.derivatives(times, states))
 
     @cached_property
     def gradients(self) -> Array:
@@ -204,9 +205,9 @@ class _Samples:
         self.calls += NEAR
         (t, start, *_), tangents = self.run.begin, self.run.tangents
         states = [tangents.with_state(start, y) for y in self.points[0][:NEAR]]
-        return tangents.state(
-            np.array([self.run.invariants.gradients(t, y, self.run.problem.derivative(t, y)) for y in states])
-        )
+        slopes = [self.run.problem.evaluate(t, y) for y in states]
+        gradients = [self.run.invariants.gradients(t, y, f) for y, f in zip(states, slopes, strict=True)]
+        return tangents.state(np.array(gradients))
 
     def states(self) -> Iterator[tuple[Array, Array, Array]]:
         """Return the state, the derivative and the gradients (l, n) at the start, and then at the first points."""
@@ -214,18 +215,18 @@ class _Samples:
         yield from zip(*self.points, self.gradients, strict=False)
 
 
-def states_near(y: Array, sizes: Array, distances: Sequence[float]) -> Array:
+def states_near(y: Array, sizes: Array, distances: tuple[float, ...]) -> Array:
     """Return states (m, n) at these distances from y, in units of the sizes of its components: the same in each run.
 
     Components that are 0 at y may have to stay nonnegative, as concentrations, and do so.
     """
-    ways = _ways(len(distances), y.size) * np.array(distances)[:, None]
-    return np.asarray(y + np.where(y == 0, np.abs(ways), ways) * sizes)
+    return BUILD.states_near(y, sizes, _ways(distances, y.size))
 
 
 @lru_cache(maxsize=8)
-def _ways(count: int, n: int) -> Array:
-    return np.tanh(np.random.default_rng(20220).standard_normal((count, n)))
+def _ways(distances: tuple[float, ...], n: int) -> Array:
+    ways = np.tanh(np.random.default_rng(20220).standard_normal((len(distances), n)))
+    return np.asarray(ways * np.array(distances)[:, None])
 
 
 def found_invariants(y: Array, f: Array) -> LinearInvariants:
@@ -235,13 +236,15 @@ def found_invariants(y: Array, f: Array) -> LinearInvariants:
     found if a derivative there is not finite; the others are left out where theirs are not finite.
     """
     n = y.shape[1]
-    none, good = LinearInvariants(np.zeros((0, n)), np.zeros((0, 0))), np.isfinite(f).all(axis=1)
-    if not good[:n].all():
-        return none
+    if BUILD.are_independent(f) or not BUILD.are_finite(f[:n]):
+        return NOTHING.linear
+    if not BUILD.are_finite(f):
+        good = np.isfinite(f).all(axis=1)
+        y, f = y[good], f[good]
     # Rows are in units of the largest rate at their state, and columns in those of the largest rate of a component.
-    size = np.abs(f[good]).max(axis=1, keepdims=True)
+    size = np.abs(f).max(axis=1, keepdims=True)
     size[size == 0] = 1.0
-    F = f[good] / size
+    F = f / size
     units = np.abs(F).max(axis=0)
     units[units == 0] = 1.0
     F /= units
@@ -249,14 +252,14 @@ def found_invariants(y: Array, f: Array) -> LinearInvariants:
     left = np.abs(left.diagonal())
     rank = int(np.count_nonzero(left > NULL * left[0]))
     if not 0 < rank < n or left[rank - 1] < CLEAR * left[0]:
-        return none
+        return NOTHING.linear
     pivots, others = order[:rank] - 1, order[rank:] - 1
     Q, R = np.linalg.qr(F[:, pivots])
     momenta, inverse = np.eye(n)[others], np.linalg.inv(R)
     momenta[:, pivots] = -(inverse @ (Q.T @ F[:, others])).T
     momenta = _without_negligible(reduced_rows(momenta, LEAST_PIVOT)) / units
     momenta = _rounded(momenta / np.abs(momenta).max(axis=1, keepdims=True))
-    rates = y[good] @ momenta.T / size
+    rates = y @ momenta.T / size
     shares = Q.T @ rates
     paired = np.linalg.norm(rates - Q @ shares, axis=0) <= NULL_RATE * np.linalg.norm(rates, axis=0)
     centres = np.zeros((np.count_nonzero(paired), n))

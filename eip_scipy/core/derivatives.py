@@ -60,6 +60,7 @@ TOLERANCES = {"jvp": (0.0, 1e-3), "dual numbers": (1e-3, 1e-12), "complex steps"
 # function. At the start itself the function may have a kink, or terms that vanish there alone.
 DISTANCES = (1e-2, 1e-4, 1e-6, 0.0)
 POWER_STEP = 2.0**-332  # a power of two, so that the product has no other error than the rounding of the function
+time_of_motion, typical_sizes = BUILD.time_of_motion, BUILD.typical_sizes
 
 
 def unless_error(function: Callable[..., Any], *args: Any) -> Any:
@@ -72,6 +73,7 @@ def unless_error(function: Callable[..., Any], *args: Any) -> Any:
         return None
 
 
+@lru_cache(maxsize=256)
 def by_duals(kind: str, *given: Any) -> Any:
     """Return the derivative of this `kind` by dual numbers, ``numba_duals.<kind>(*given)``, which loads Numba.
 
@@ -420,24 +422,6 @@ def _with_products(fun: Any, form: str, jvp: Any, n: int, count: int) -> Any:
             out[n * k : n * (k + 1)] = jvp(t, y, Y[n * k : n * (k + 1)], *extra)
 
     return compiled_like(rhs, fun, jvp)
-
-
-def typical_sizes(y: Array, f: Array, tau: float) -> Array:
-    """Return for each component a size that is added to |y_k|, so that shifts do not vanish with the component.
-
-    The size is ``abs(tau * f[k])``, the motion in a step of length `tau`, and at least 1e-3 |y_k|. If both are
-    0, it is the largest size of the other components, or 1 if all are 0.
-    """
-    floors = np.where(np.isfinite(f), np.abs(tau * f), 0.0)
-    floors = np.maximum(floors, 1e-3 * np.abs(y))
-    floors[floors == 0] = floors.max(initial=0.0) or 1.0
-    return floors
-
-
-def time_of_motion(y: Array, f: Array) -> float:
-    """Return the time in which a state changes by its own size; infinite if the state or its derivative is 0."""
-    moving, size = float(np.abs(f).max(initial=0.0)), float(np.abs(y).max(initial=0.0))
-    return size / moving if moving > 0 and size > 0 else np.inf
 
 
 @lru_cache

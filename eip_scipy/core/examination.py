@@ -7,6 +7,7 @@ in engine/cpp/trust.hpp). The invariants need not show an error in them.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
@@ -41,6 +42,8 @@ UNRESOLVED = {2: 0.1, 3: 0.03, 4: 1e-2, 8: 2e-3}
 LOST = 0.3
 # Share of its length by which a whole number of steps may miss an interval.
 ROUNDING = 1e-12
+# Numbers of steps after which a check is due.
+CHECKS = [10**k for k in range(1, 20)]
 
 Array = np.ndarray
 Derivative = Callable[[float, Array], Array]
@@ -48,12 +51,12 @@ Derivative = Callable[[float, Array], Array]
 
 def steps_to_check(steps: int) -> int:
     """Return the number of steps from step `steps` to the next check, which is due after 10, 100, 1000, ... steps."""
-    return int(10 ** len(str(steps))) - steps
+    return CHECKS[bisect_right(CHECKS, steps)] - steps
 
 
 def is_check_due(steps: int) -> bool:
     """Return True if a check of the invariants is due after `steps` steps."""
-    return steps > 0 and steps_to_check(steps - 1) == 1
+    return steps in CHECKS
 
 
 @dataclass
@@ -76,14 +79,8 @@ class Examiner:
 
     def finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return a sentence about an invariant or a gradient that is wrong at a state of the run, or None."""
-        known, directions = self.invariants, random_directions(y.size, y.dtype.kind == "c")
-        of_run = known.target, known.scales, self.tau, known.t_span, directions
-
-        def is_in_order() -> bool:  # by a quicker look, which also notes rates
-            return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
-
         with np.errstate(all="ignore"):
-            if not known.balances.items and unless_error(is_in_order) is not False:
+            if not self.invariants.balances.items and unless_error(self._is_in_order, rhs, t, y) is not False:
                 return None
             return unless_error(self._finding, rhs, t, y)
 
@@ -101,6 +98,12 @@ class Examiner:
                 waited = int(suspect[data.SUSPECT_WAITED])
                 return unless_error(self._along_chord, rhs, (t_old, t_new), (old, new), waited)
         return None
+
+    def _is_in_order(self, rhs: Derivative, t: float, y: Array) -> bool:
+        """Return False if a quick look, which also notes rates, finds something that is wrong."""
+        known, ways = self.invariants, random_directions(y.size, y.dtype.kind == "c")
+        of_run = known.target, known.scales, self.tau, known.t_span, ways
+        return bool(known.functions.look(self.figures, t, y, rhs(t, y), *of_run))
 
     def _finding(self, rhs: Derivative, t: float, y: Array) -> str | None:
         """Return the text of the first of the `findings` at a state, if f is finite there, and note rates."""

@@ -11,8 +11,8 @@ import math
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BY_NAME", "GRADIENT", "AccelerationField", "ChangedShapeError", "CompiledFunction", "Kind", "NotCompilableError",
-    "PointerFunction", "are_same", "by_pointer", "compilable", "compiled_calls", "compiled_like", "extra_arguments",
+    "PointerFunction", "are_same", "by_address", "by_pointer", "compilable", "compiled_like", "extra_arguments",
     "floats", "is_compiled", "is_jitted", "is_pointer", "jit_is_off", "jitted", "jitted_call", "names",
     "native_functions", "own_values", "parameter_values", "reraise_user_exception", "scalars",
 ]  # fmt: skip
@@ -327,36 +327,38 @@ class CompiledFunction(NamedTuple):
 
 
 class _Compiler:
-    """The functions of one run, whose states have the type of `y0`, in the groups of the engine."""
+    """The functions of one run in the groups of the engine; `kind` has the arguments that all of them receive."""
 
-    def __init__(self, y0: np.ndarray, extra: tuple, parameters: np.ndarray) -> None:
-        types = scalars(extra)
-        if types is None:
-            raise NotCompilableError("args are neither numbers nor one array of floats")
-        self._dtype, self._scalars, self._p = y0.dtype.char, types, parameters.size if extra else -1
-        self._width, self._is_off = 1 if y0.dtype == float else 2, jit_is_off()
-        self.found, self.pairs = defaultdict[str, list[CompiledFunction]](list), defaultdict[str, list[Any]](list)
+    found: dict[str, list[CompiledFunction]]
+    pairs: dict[str, list[tuple[Any, int]]]
 
-    def add(
-        self, group: str, fun: Any, name: str, shape: tuple[int, ...], size: int, real: bool = False, **form: bool
-    ) -> None:
-        """Add `fun` to the `group`; see `Kind` for the signature, and `name` is its name in messages."""
-        entry = function = fun
-        if isinstance(fun, PointerFunction):
-            entry = fun.address
-        elif fun is not None and not isinstance(fun, LibraryFunction):
-            if self._is_off:
-                raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
-            if not is_jitted(fun):
-                why = getattr(fun, "not_jitted", "")  # of a function of this package that calls one of the user
-                raise NotCompilableError(why or f"{name} is not a Numba function; decorate it with @numba.njit")
-            from .numba_bridge import compiled  # which loads Numba
+    def __init__(self, kind: Kind) -> None:
+        self._kind, self._is_off = kind, jit_is_off()
+        self.found, self.pairs = defaultdict(list), defaultdict(list)
 
-            function = compiled(fun, Kind(shape, size, self._p, self._dtype, real, scalars=self._scalars, **form), name)
-            entry = function.address
-        count = math.prod(shape) * (1 if real else self._width)
-        self.found[group].append(CompiledFunction(function, count, entry))
-        self.pairs[group].append((entry, count))
+    def add(self, group: str, fun: Any, name: str, known: ByAddress | None = None, **form: Any) -> None:
+        """Add `fun` to the `group`, whose `form` is in fields of `Kind`; `name` is its name in messages.
+
+        `known` is its C function, if it has been compiled.
+        """
+        shape, real = form["shape"], form.get("real") or self._kind.dtype == "d"
+        count = math.prod(shape) * (1 if real else 2)
+        if known is not None:
+            found = CompiledFunction(known.function, count, known.address)
+        elif fun is None or isinstance(fun, LibraryFunction):
+            found = CompiledFunction(fun, count, fun)
+        elif isinstance(fun, PointerFunction):
+            found = CompiledFunction(fun, count, fun.address)
+        elif self._is_off:
+            raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
+        elif not is_jitted(fun):
+            why = getattr(fun, "not_jitted", "")  # of a function of this package that calls one of the user
+            raise NotCompilableError(why or f"{name} is not a Numba function; decorate it with @numba.njit")
+        else:
+            function = _compiled(fun, self._kind._replace(**form), name)
+            found = CompiledFunction(function, count, function.address)
+        self.found[group].append(found)
+        self.pairs[group].append((found.entry, count))
 
     def together(self) -> int | None:
         """Return the address of one C function of all functions of a run, or None if there is none.
@@ -365,7 +367,7 @@ class _Compiler:
         """
         groups = [[known.function for known in self.found[name]] for name in ("rhs", "inv", "grad")]
         functions = [[cast("Compiled", part) for part in group if hasattr(part, "library")] for group in groups]
-        if self._width > 1 or functions != groups or any(part.kind.takes_f for part in chain(*functions)):
+        if self._kind.dtype != "d" or functions != groups or any(part.kind.takes_f for part in chain(*functions)):
             return None
         from .in_one_pass import in_one_pass
 
@@ -373,6 +375,13 @@ class _Compiler:
         address, library = in_one_pass(rhs, tuple(inv), tuple(grad))
         self.found["together"].append(library)
         return address
+
+
+@lru_cache(maxsize=256)
+def _compiled(fun: Any, kind: Kind, name: str) -> Compiled:
+    from .numba_bridge import compiled  # which loads Numba
+
+    return compiled(fun, kind, name)
 
 
 def native_functions(run: Run) -> tuple[NativeFunctions, str]:
@@ -385,24 +394,28 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     problem, invariants, n, tableau = run.problem, run.invariants, run.y0.size, run.method
     if tableau.in_python:
         raise NotCompilableError(f"{tableau.name} is a {'solver' if tableau.drives else 'one-step method'} in Python")
-    compiler = _Compiler(run.y0, problem.extra, problem.parameters)
+    if problem.kind is None:
+        raise NotCompilableError("args are neither numbers nor one array of floats")
+    compiler = _Compiler(problem.kind)
     (fun, form), add, pairs = problem.native_form, compiler.add, compiler.pairs
     second_order = form.startswith("acceleration")
     name, size = ("acceleration", n // 2) if second_order else ("fun", n)
-    add("rhs", fun, name, (size,), size, in_place=form.endswith("place"))
+    add("rhs", fun, name, problem.call.compiled, shape=(size,), size=size, in_place=form.endswith("place"))
     for k in range(len(invariants.items)):
-        _add_invariant(add, run, k, n)
+        _add_invariant(add, run, k)
     for k, item in invariants.balances.items.items():
-        name, takes_f = f"rate of balance {invariants.labels[k]!r}", item.rate_uses_f
-        add("rate", item.rate_function, name, invariants.shapes[k], n, real=True, takes_f=takes_f, gradient=True)
+        name = f"rate of balance {invariants.labels[k]!r}"
+        own: dict[str, Any] = {"real": True, "takes_f": item.rate_uses_f}
+        add("rate", item.rate_function, name, shape=invariants.shapes[k], gradient=True, **own)
     if run.uses_jacobian:
-        add("jacobian", problem.jacobian, "jacobian", (n // 2,), n // 2, takes_f=True, in_place=True, gradient=True)
+        own = {"takes_f": True, "in_place": True, "gradient": True}
+        add("jacobian", problem.jacobian, "jacobian", shape=(n // 2,), size=n // 2, **own)
     reason = ""
     try:
         for k, event in enumerate(problem.events.functions):
             alone = getattr(event, "unaugmented", None)
             event, size = (event, n) if alone is None else (alone.function, alone.n)
-            add("event", getattr(event, "jitted", event), f"event {k}", (), size, real=True)
+            add("event", getattr(event, "jitted", event), f"event {k}", shape=(), size=size, real=True)
     except NotCompilableError as error:
         pairs["event"], compiler.found["event"], reason = [], [], str(error)
     rates = [entry for entry, _ in pairs["rate"]]
@@ -425,37 +438,47 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     ), reason
 
 
-def _add_invariant(add: Callable[..., None], run: Run, k: int, n: int) -> None:
+def _add_invariant(add: Callable[..., None], run: Run, k: int) -> None:
     """Add invariant k of a run: its value, its gradient, and derivatives by parameters of an augmented state."""
     invariants = run.invariants
     from_f = invariants.starts[k] in run.conserved.rows_from_f  # the engine takes differences where f does not serve
     item, label, shape = invariants.items[k], invariants.labels[k], invariants.shapes[k]
-    name, alone = f"invariant {label!r}", item.unaugmented
+    value, gradient = (calls[k].compiled for calls in invariants.calls)
+    name, alone, size = f"invariant {label!r}", item.unaugmented, invariants.shape[1]
     if alone is not None:
-        item, n = alone.function, alone.n
+        item, size, value, gradient = alone.function, alone.n, None, None
     if item.args:
         raise NotCompilableError(f"{name} has args; pass its parameters through params")
-    add("inv", item.function, name, shape, n, real=True)
+    add("inv", item.function, name, value, shape=shape, size=size, real=True)
     if item.gradient is None and not (from_f or isinstance(item.function, PointerFunction)):
         raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
     form = {"takes_f": item.uses_f, "in_place": item.in_place, "gradient": True}
-    add("grad", item.gradient, f"gradient of {name}", (*shape, n), n, **form)
+    add("grad", item.gradient, f"gradient of {name}", gradient, shape=(*shape, size), size=size, **form)
     if alone is not None and alone.by_parameters is not None:
-        rows = (*shape, alone.parameters)
-        add("by_parameters", alone.by_parameters, f"derivatives by parameters of {name}", rows, n, real=True)
+        rows, name = (*shape, alone.parameters), f"derivatives by parameters of {name}"
+        add("by_parameters", alone.by_parameters, name, shape=rows, size=size, real=True)
 
 
-def compiled_calls(calls: Iterable[Call], n: int, dtype: np.dtype[Any]) -> list[Call]:
-    """Return calls with C functions for Numba functions ``fun(t, y)`` that compile for states (n,) of type `dtype`."""
-    found, is_off = [], jit_is_off()
-    for call in calls:
-        if is_jitted(call.fun) and not (is_off or call.args or call.takes_f or call.in_place):
-            from .numba_bridge import compiled_or_none
+class ByAddress(NamedTuple):
+    """The C function of a `Call`; it receives `params`, and f too if `takes_f`. `function` keeps the address valid."""
 
-            kind = Kind(call.shape, n, -1, dtype.char, call.real)
-            call = call._replace(compiled=compiled_or_none(call.fun, kind))
-        found.append(call)
-    return found
+    address: int
+    takes_f: bool
+    params: np.ndarray
+    function: Any
+
+
+def by_address(call: Call, name: str, kind: Kind | None, params: np.ndarray, n: int, *, gradient: bool = False) -> Call:
+    """Return a call, `name` in messages, with its C function if Numba can compile it for states (n,) of this `kind`."""
+    if kind is None or not is_jitted(call.fun):
+        return call
+    _, _, p, dtype, *_, types = kind
+    kind = Kind(call.shape, n, p, dtype, call.real, call.takes_f, call.in_place, gradient, types)
+    try:
+        function = _compiled(call.fun, kind, name)
+    except NotCompilableError:
+        return call
+    return call._replace(compiled=ByAddress(function.address, gradient, params, function))
 
 
 def reraise_user_exception(

@@ -17,15 +17,15 @@ from ..engine.data import EPS, Grouping
 from ..engine.native import BUILD, Call, LibraryFunction, Rates, call
 from .callers import users_level
 from .derivatives import NumericalGradient, difference_gradient, typical_sizes, unless_error, with_duals
-from .functions import NotCompilableError, PointerFunction, names
+from .functions import Kind, NotCompilableError, PointerFunction, by_address, names
 from .inputs import filled, numbers, require_arguments, shown, states
-from .invariant_checks import findings, listed, reported, time_derivative
+from .invariant_checks import listed, time_derivative
 from .invariants import Invariant, as_invariants, with_targets
 
 __all__ = ["BalanceSet", "InvariantSet", "check_gradient"]
 
 Array = np.ndarray
-FLOAT = np.dtype(float)
+FLOAT, NO_PARAMS = np.dtype(float), np.zeros(0)
 
 TARGET_TOLERANCE = 1e-8
 # A value that misses its target by at most this many roundings of the state meets it.
@@ -98,7 +98,7 @@ def _first_value(item: Invariant, label: str, t: float, y: Array, extra: tuple) 
         raise ValueError(f"{what} returned shape {value.shape}; expected a number or one dimension (l,).")
     if item.size not in (None, value.size):
         raise ValueError(f"{what} returned {value.size} values, but has size={item.size}.")
-    return value.astype(float)
+    return value
 
 
 def _check_filling(gradient: Call, what: str, t: float, y: Array, f: Array) -> None:
@@ -124,14 +124,23 @@ class BalanceSet:
     given rates are checked: they must be real and finite, and have the shape of the balance.
     """
 
+    parts: tuple[tuple[int, int], ...] = ()
+    places, most_slowness = np.zeros(0, np.int64), np.zeros(0)
+    calls: Sequence[Call | None] = ()
+    _given: Sequence[tuple[slice, Call]] = ()
+
     def __init__(self, known: InvariantSet, t: float, y: Array, f: Array) -> None:
         self.items = {k: item for k, item in enumerate(known.items) if item.is_balance}
-        self.mask = known.of_values([item.is_balance for item in known.items])
-        self.places = np.flatnonzero(self.mask).astype(np.int64)
-        self.most_slowness = known.of_values([item.most_slowness for item in known.items], float)[self.places]
+        self.mask = np.zeros(known.size, bool)
+        if not self.items:
+            return
+        values = [(place, item) for k, item in self.items.items() for place in range(*known.starts[k : k + 2])]
+        self.places = np.array([place for place, _ in values], np.int64)
+        self.most_slowness = np.array([item.most_slowness for _, item in values])
+        self.mask[self.places] = True
         self.parts = tuple((k, known.starts[k + 1] - known.starts[k]) for k in self.items)
-        self.calls: list[Call | None] = []
-        self._given: list[tuple[slice, Call]] = []
+        self.calls = calls = []
+        self._given = own = []
         for k, item in self.items.items():
             is_given, shape = item.rate_function is not None, known.shapes[k]
             if not is_given and known.dtype == FLOAT:
@@ -139,10 +148,10 @@ class BalanceSet:
                     self.items[k] = item = with_duals(item, "rate", y.size, shape, known.extra)
             rate, args, what = item.rate_function, item.args + known.extra, f"rate of balance {known.labels[k]!r}"
             found = None if rate is None else _real_call(rate, args, what, shape, takes_f=item.rate_uses_f)
-            self.calls.append(found)
+            calls.append(found)
             if is_given and found is not None:
                 place = slice(*known.starts[k : k + 2])
-                self._given.append((place, found))
+                own.append((place, found))
                 value = self.known(t, y, f)[place]
                 if not np.isfinite(value).all():
                     raise ValueError(f"{what} is not finite at y0: it returned {value}.")
@@ -161,13 +170,13 @@ class InvariantSet:
 
     The start is the time, the state, the derivative and the length of a step. The values and their shapes are checked
     there. `extra` are the run's further arguments. Invariants are evaluated only at times from t0 to `t_bound`, by
-    default only at t0. `rhs` is the right-hand side of the system, for checks.
+    default only at t0. Numba functions are called as C functions with `params` if their `kind` is given.
 
     Item k has the values with the indices from `starts[k]` to `starts[k + 1]`, of the shape `shapes[k]`. The `target`
     of `balances` are the values that the run integrates. `kinds` are groups of components that have the same unit, or
     None. `why_not` has, by label, the reasons why jitted invariants have no compiled gradient. Masks (l,) of the
-    values: the user gave the target of the `given`, and the gradients of the `computed` come from complex steps,
-    quadratic forms or differences. `given_gradients` says of each item whether the user gave its gradient.
+    values: the gradients of the `computed` come from complex steps, quadratic forms or differences. `given` and
+    `given_gradients` say of each item whether the user gave its target, and its gradient.
     """
 
     def __init__(
@@ -180,9 +189,11 @@ class InvariantSet:
         extra: tuple = (),
         *,
         t_bound: float | None = None,
-        rhs: Callable[[float, Array], Array] | None = None,
+        kind: Kind | None = None,
+        params: Array = NO_PARAMS,
     ) -> None:
-        self.t_span, self.rhs, self.tau = (t0, t0 if t_bound is None else t_bound), rhs, tau
+        self._kind, self._params = kind, params
+        self.t_span, self.tau = (t0, t0 if t_bound is None else t_bound), tau
         self.kinds: Grouping | None = None
         self.extra, self._start = extra, (y0, f0, tau)
         self.why_not: dict[str, str] = {}
@@ -191,12 +202,15 @@ class InvariantSet:
         pairs = zip(given, self.labels, strict=True)
         values = [_first_value(item, label, t0, y0, extra) for item, label in pairs]
         self.shapes = [value.shape for value in values]
-        self.scalar = [shape == () for shape in self.shapes]
+        self.scalar = not any(self.shapes)
         self.starts = list(accumulate((value.size for value in values), initial=0))
         self.size = self.starts[-1]
         self.shape, self.dtype = (self.size, y0.size), y0.dtype
-        self.start_values = np.concatenate([value.ravel() for value in values]) if values else np.zeros(0)
-        self.names = [name for k in range(len(given)) for name in self._names(k)]
+        self.start_values = np.concatenate(values, axis=None) if values else np.zeros(0)
+        self.names: list[str] = []
+        for item, label, value in zip(given, self.labels, values, strict=True):
+            own = [f"{label}[{j}]" for j in range(value.size)] if value.ndim else [label]
+            self.names += item.value_names or own
         for name, number in zip(self.names, self.start_values.tolist(), strict=True):
             if not math.isfinite(number):
                 raise ValueError(f"invariant {name!r} is not finite at y0: it returned {number}.")
@@ -208,7 +222,7 @@ class InvariantSet:
         self.scales = self._spread("scale", np.zeros(self.size))
         self.grads = [self._gradient_of(item, t0, y0) for item in self.items]
         self.target = self._spread("target", self.start_values.copy())
-        self.given = self.of_values([item.target is not None and not item.is_measured for item in self.items])
+        self.given = [item.target is not None and not item.is_measured for item in self.items]
         self.calls = tuple(map(self._value_call, range(len(given)))), tuple(map(self._gradient_call, range(len(given))))
         self.functions: Any = BUILD.InvariantFunctions(*self.calls, y0.size, y0.dtype != FLOAT)
         self.start_gradients = self._gradients_at_start(t0, y0, f0)
@@ -217,13 +231,7 @@ class InvariantSet:
     def of_values(self, of_items: Sequence[Any], dtype: Any = bool) -> Array:
         """Return an array (l,) in which the flag or the number of each item is repeated as often as it has values."""
         found = np.array(of_items, dtype)
-        return found if all(self.scalar) else np.repeat(found, np.diff(self.starts))
-
-    def _names(self, k: int) -> Sequence[str]:
-        """Return the names of the values of item k: its `value_names`, if any, else its label, with an index."""
-        label, size = self.labels[k], self.starts[k + 1] - self.starts[k]
-        own = [label] if self.scalar[k] else [f"{label}[{j}]" for j in range(size)]
-        return self.items[k].value_names or own
+        return found if self.scalar else np.repeat(found, np.diff(self.starts))
 
     def _with_gradient(self, item: Invariant, k: int) -> Invariant:
         """Return item k with a compiled gradient if it can have one; if not, store the reason in `why_not`."""
@@ -253,11 +261,6 @@ class InvariantSet:
     def floors(self) -> Array:
         """Return the `typical_sizes` (n,) of the components at the start, units that do not vanish with a component."""
         return typical_sizes(*self._start)
-
-    @property
-    def by_numbers(self) -> Array:
-        """Return a mask of the values whose gradients come from complex steps or differences."""
-        return self.of_values([isinstance(grad, NumericalGradient) for grad in self.grads])
 
     @property
     def by_values(self) -> Array:
@@ -309,8 +312,9 @@ class InvariantSet:
             )
 
     def _value_call(self, k: int) -> Call:
-        item = self.items[k]
-        return _real_call(item.function, item.args + self.extra, f"invariant {self.labels[k]!r}", self.shapes[k])
+        item, what = self.items[k], f"invariant {self.labels[k]!r}"
+        found = _real_call(item.function, item.args + self.extra, what, self.shapes[k])
+        return found if item.args else by_address(found, what, self._kind, self._params, self.shape[1])
 
     def _gradient_call(self, k: int) -> Call:
         item, what, dtype = self.items[k], f"gradient of invariant {self.labels[k]!r}", self.dtype
@@ -322,13 +326,14 @@ class InvariantSet:
         if item.gradient is None:
             return call(self.grads[k], self.extra, shape, convert)
         arguments = item.args + self.extra
-        return call(item.gradient, arguments, shape, convert, takes_f=item.uses_f, in_place=item.in_place)
+        found = call(item.gradient, arguments, shape, convert, takes_f=item.uses_f, in_place=item.in_place)
+        return found if item.args else by_address(found, what, self._kind, self._params, self.shape[1], gradient=True)
 
     def _gradients_at_start(self, t: float, y: Array, f: Array) -> Array:
         """Return the gradients (l, n) at the start; raise an error for wrong shapes and numbers that are not finite."""
         try:
-            for gradient, label in zip(self.calls[1], self.labels, strict=True):
-                if gradient.in_place and not isinstance(gradient.fun, LibraryFunction):
+            for gradient, label, is_given in zip(self.calls[1], self.labels, self.given_gradients, strict=True):
+                if is_given and gradient.in_place and not isinstance(gradient.fun, LibraryFunction):
                     _check_filling(gradient, f"gradient of invariant {label!r}", t, y, f)
             G = self.gradients(t, y, f)
         except TypeError:
@@ -346,7 +351,7 @@ class InvariantSet:
     @property
     def fixed_target(self) -> Array:
         """Return the target values (l,) of the whole run; NaN for balances, whose values change."""
-        return np.where(self.balances.mask, np.nan, self.target)
+        return np.where(self.balances.mask, np.nan, self.target) if self.balances.items else self.target.copy()
 
     def with_targets(self, *, at_end: bool = True) -> tuple[Invariant, ...]:
         """Return the invariants, with targets, for a run that continues this one; those of balances only `at_end`."""
@@ -449,23 +454,17 @@ class InvariantSet:
 
     def start_violation(self, t: float, y: Array, f: Array) -> str | None:
         """Return a message if the start misses given targets, with the worst invariant first; otherwise None."""
-        if not np.count_nonzero(self.given):
+        if not any(self.given):
             return None
+        given = self.of_values(self.given)
         excess = np.nan_to_num(self._excess(t, y, f), nan=np.inf, posinf=np.inf)
-        missed = [int(k) for k in np.argsort(-excess, kind="stable") if excess[k] > 1.0 and self.given[k]]
+        missed = [int(k) for k in np.argsort(-excess, kind="stable") if excess[k] > 1.0 and given[k]]
         if not missed:
             return None
         residual = (self.values(t, y) - self.target)[missed[0]]
         others = [self.names[k] for k in missed[1:]]
         text = f"the start violates invariant {self.names[missed[0]]!r} by {residual:.3g}"
         return text + (f", and also {listed(others)}" if others else "")
-
-    def check(
-        self, t: float, y: Array, f: Array, tau: float, evaluated: tuple[Array, Array] | None = None
-    ) -> list[str]:
-        """Check the invariants at the start, with step `tau`: raise ValueError or warn; return the warnings' texts."""
-        assert self.rhs is not None
-        return reported(findings(self, t, y, f, tau, self.rhs, evaluated))
 
 
 def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., Any] | None = None) -> float:

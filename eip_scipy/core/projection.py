@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..engine import data
 from ..engine.data import EPS, FrameRows, Grouping, Options
+from ..engine.native import BUILD
 from ..engine.trust import FAR_IN_TOLERANCES, MOST_FAR
 from ..methods.base import PROJECTION_ONLY, Method
 from .inputs import count, flag, numbers, real_array, shown
@@ -27,7 +28,7 @@ from .invariants import Invariant
 from .step_control import StepControl
 
 __all__ = [
-    "INDEX", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "are_combinations", "is_canonical",
+    "INDEX", "ProjectionDetails", "ProjectionKeywords", "ProjectionOptions", "are_combinations",
     "linear_rows", "takes_projection_options", "weights",
 ]  # fmt: skip
 
@@ -177,8 +178,10 @@ class ProjectionOptions:
         groups, linear = _blocks(self.blocks, n, width), self.given_linear_invariants
         adaptive, distant = stepping.h is None, data.DISTANT
         if adaptive:
-            distant = min(max(FAR_IN_TOLERANCES * float(stepping.rtol.max(initial=0.0)), distant), MOST_FAR)
+            largest = float(np.maximum.reduce(stepping.rtol, initial=0.0))
+            distant = min(max(FAR_IN_TOLERANCES * largest, distant), MOST_FAR)
         band = data.BAND_COMPENSATED if compensated else data.BAND
+        bound = [given and not method.has_history for given in known.given]
         options = Options(
             rtol=stepping.rtol.repeat(width),
             atol=stepping.atol,
@@ -192,7 +195,7 @@ class ProjectionOptions:
             scales=known.scales,
             computed=known.computed.astype(float),
             # Multistep methods pass the errors instead of the targets; the remaining errors are negligible.
-            most_left=np.where(known.given & (not method.has_history), MOST_LEFT, np.inf),
+            most_left=known.of_values([MOST_LEFT if given else np.inf for given in bound], float),
             kinds=_unit_groups(groups, y0, f0),
             masses=np.zeros((known.size, 0)),
             kappa=method.metric_exponent,
@@ -358,21 +361,8 @@ def _block_atol(atol: Array, groups: Grouping) -> Array:
 
 def _unit_groups(groups: Grouping, y: Array, f: Array) -> Grouping:
     """Return the floats in groups with a common unit: the blocks, or without blocks the halves of a state (q, p)."""
-    halves = 0 < y.size < len(groups.start) and is_canonical(y, f)
+    halves = 0 < y.size < len(groups.start) and BUILD.is_canonical(y, f)
     return _blocks(y.size // 2, y.size, 1) if halves else groups
-
-
-def is_canonical(y: Array, f: Array) -> bool:
-    """Return True if a state y with the derivative f is taken as (q, p).
-
-    It is real and has an even number n of components, ``f[: n // 2]`` and ``p = y[n // 2 :]`` are both zero or both
-    nonzero, and the sum of ``f[: n // 2] * sign(p)`` is not negative.
-    """
-    if y.size % 2 or y.dtype.kind == "c":
-        return False
-    q_dot, p = f[: y.size // 2], y[y.size // 2 :]
-    with np.errstate(over="ignore", invalid="ignore"):  # not by BLAS, whose rounding differs between processors
-        return bool(q_dot.any() == p.any() and (q_dot * np.sign(p)).sum() >= 0)
 
 
 def linear_rows(given: Any, n: int, width: int) -> FrameRows:

@@ -134,12 +134,17 @@ class Diagnostics:
 
         The size is below 5 in most correct runs. None if no correction was measured.
         """
-        return self._trust.worst
+        figures = self._trust.figures
+        if not np.any(figures[:, data.JUDGED] > 0):
+            return None
+        k = int(np.argmax(figures[:, data.NU]))
+        return self.names[k], float(figures[k, data.AT]), float(figures[k, data.NU])
 
     @property
     def corrections(self) -> np.ndarray:
         """Largest correction of each invariant, (l,), in the unit of `worst`; nan if none was measured."""
-        return self._trust.corrections
+        figures = self._trust.figures
+        return np.where(figures[:, data.JUDGED] > 0, figures[:, data.NU], np.nan)
 
     @property
     def slowness(self) -> np.ndarray:

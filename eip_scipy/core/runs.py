@@ -11,14 +11,14 @@ import numpy as np
 
 from ..engine import data
 from ..engine.data import EPS, NOTHING, OK, PENDING, REASON, Schedule, Work, bare_schedule
-from ..engine.native import BUILD, Call, Engine, Hooks, NativeFunctions, PythonFunctions
+from ..engine.native import BUILD, Call, Engine, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
 from .callers import users_level
 from .conserved import Conserved, confirmed, conserved, states_near
 from .examination import Derivative, Examiner, is_check_due, unresolved
 from .failures import projection_failure
-from .invariant_checks import Finding, listed, reported
+from .invariant_checks import Finding, findings, listed, reported
 from .invariant_set import TARGET_TOLERANCE, InvariantSet
 from .projection import ProjectionOptions, are_combinations, linear_rows
 from .results import Diagnostics, slowness
@@ -180,8 +180,11 @@ class Run:
         self.trust = Trust(invariants.names, work.trust)
 
     def _invariants_at(self, start: Start) -> InvariantSet:
-        extra, rhs, t_bound = self.problem.extra, self.problem.derivative, self.stepping.span.t_bound
-        return InvariantSet(self.projection.invariants, *start, extra, t_bound=t_bound, rhs=rhs)
+        problem, t_bound = self.problem, self.stepping.span.t_bound
+        return InvariantSet(
+            self.projection.invariants, *start, problem.extra, t_bound=t_bound,
+            kind=problem.called_kind, params=problem.parameters,
+        )  # fmt: skip
 
     def _check(self, checks: bool) -> None:
         """Project the start if that is requested, and check the invariants and the steps there if `checks`."""
@@ -199,7 +202,8 @@ class Run:
             )
         if self.options.watched and checks and BUILD.are_finite(self.start.f.view(float)):
             known = (self.work.G, self.work.values) if self.start is self.begin else None
-            self.trust.doubts += self.invariants.check(*self.start[:3], self.invariants.tau, known)
+            found = findings(self.invariants, *self.start[:3], self.invariants.tau, rhs, known)
+            self.trust.doubts += reported(found)
         if self.projection.check and checks:
             text = self.method.contradiction(self, self.start)
             if text is not None:
@@ -217,7 +221,7 @@ class Run:
         held = are_combinations(linear, G.view(float))
         if not np.count_nonzero(held):
             return self.options.scales
-        (away,) = states_near(y0, np.abs(y0) + tau * np.abs(f0), [COMBINATION_DISTANCE])
+        (away,) = states_near(y0, np.abs(y0) + tau * np.abs(f0), (COMBINATION_DISTANCE,))
         held &= are_combinations(linear, invariants.gradients(t0, away, f0).view(float))
         return np.where(held, invariants.sizes_of_terms(y0, G, self.work.values) / EPS, self.options.scales)
 
@@ -262,10 +266,10 @@ class Run:
 
     def engine(self, functions: PythonFunctions | NativeFunctions, *, begins: bool = True) -> Engine:
         """Return the engine of the run, which it `begins` or continues; work.K[0] must hold the derivative there."""
-        joint = None if functions.native else self.options.joint
-        hooks = self.method.hooks(self.stepper, self.work)._replace(joint=joint)
-        needed = hooks if hooks != Hooks() else None
-        engine, w = Engine(self.stepper, self.options, self.work, functions, self.schedule, needed), self.work
+        hooks, joint, w = None, None if functions.native else self.options.joint, self.work
+        if joint is not None or self.method.in_python:
+            hooks = self.method.hooks(self.stepper, w)._replace(joint=joint)
+        engine = Engine(self.stepper, self.options, w, functions, self.schedule, hooks)
         if self.options.watched and begins:
             t, f = self.schedule.span.t0, w.K[0]
             if self.start is not self.begin:  # the buffers have the values and gradients at `begin`
@@ -316,31 +320,30 @@ class Run:
         return bool(BUILD.call(self._look, steps, ended, t, y))
 
     def _look(self, steps: int, ended: bool, t: float, y: Array) -> bool:
-        rhs, suspect = self.problem.derivative, self.work.suspect
-        if self.trust.failed or not self.options.watched:  # a failure has its own message
+        rhs, suspect, trust = self.problem.derivative, self.work.suspect, self.trust
+        if trust.failed or not self.options.watched:  # a failure has its own message
             return False
-        if ended and (text := self._fast_balances()):
+        if ended and self.invariants.balances.items and (text := self._fast_balances()):
             warnings.warn(text, UserWarning, stacklevel=users_level())
-        if ended or is_check_due(steps):
+        if is_due := ended or is_check_due(steps):
             self._drop_refuted_rows(t, y, rhs)
         found, is_flagged = None, suspect[REASON] != NOTHING
-        if not self.trust.doubts:
+        if not trust.doubts:
             found = self.examiner.examine(suspect, rhs) if is_flagged else None
-            is_due = (ended or is_check_due(steps)) and steps != self.looked
-            if found is None and (is_due or self._is_doubtful(ended)):
+            if found is None and ((is_due and steps != self.looked) or trust.is_doubtful(ended)):
                 self.looked = steps
                 found = self.examiner.finding(rhs, t, y)
         elif is_flagged and not self.work.trust[:, data.EXAMINED].any():
             self.examiner.examine(suspect, rhs)  # once more for the rates, which are used to judge corrections
-        self.trust.doubts += [found] if found else []
-        return found is not None or self._is_doubtful(ended)
+        trust.doubts += [found] if found else []
+        return found is not None or trust.is_doubtful(ended)
 
     def slowed(self, steps: int, t: float, y: Array) -> str:
         """Return a sentence if the projections of a faulty run make its adaptive steps much shorter; else "".
 
         After 100, 1000, ... steps, which led to (t, y), some are made from there without projections, for comparison.
         """
-        faulty = self.options.adaptive and not self.method.in_python and self.trust.beyond_doubt and self.trust.doubts
+        faulty = self.trust.doubts and self.options.adaptive and not self.method.in_python and self.trust.is_doubtful()
         if not faulty or steps < LEAST_STEPS or not is_check_due(steps):
             return ""
         problem, span = self.problem, self.stepping.span
@@ -359,14 +362,10 @@ class Run:
             return ""
         return f"its projections make the steps {longer:.3g} times shorter than the equations need, and it was ended"
 
-    def _is_doubtful(self, ended: bool) -> bool:
-        """Return True if corrections or errors show that the run is faulty, before its end without hope of recovery."""
-        return self.trust.exceeds_bounds if ended else self.trust.beyond_doubt
-
     def _fast_balances(self) -> str:
-        """Return a text about balances that change too fast to be useful; "" without any, or after the first call."""
+        """Return a text about balances that change too fast to be useful; "" without any, or after the first one."""
         balances = self.invariants.balances
-        if not balances.items or self._warned_of_balances:
+        if self._warned_of_balances:
             return ""
         found = slowness(self.work.slow)
         fast = np.flatnonzero(found > balances.most_slowness)

@@ -182,7 +182,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         t0, t_bound = interval((t0, t_bound))
         super().__init__(fun, t0, start, t_bound, vectorized, support_complex=True)
         variations = None if context is None else context.variations
-        problem = BoundProblem(fun, start, variations=variations, vectorized=vectorized, **jacobians)
+        problem = BoundProblem(fun, start, variations=variations, vectorized=vectorized, by_address=True, **jacobians)
         longest = np.inf if is_number(max_step) and np.isnan(max_step) else max_step  # NaN sets no bound, as in SciPy
         name, control = type(self).__name__, {"h": h, "first_step": first_step, "max_step": longest}
         stepping = StepControl.of(name, self.TABLEAU, (t0, t_bound), problem.n, **control, rtol=rtol, atol=atol)
@@ -190,7 +190,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         self._bound_fun = self.fun
         self._take_stepping(stepping, rtol, atol)
         if self.h is None and stepping.first_step is None:
-            stepping.require_scale(run.tangents.state(start))
+            stepping.scale(run.tangents.state(start))
         plain = not (projection.invariants or projection.compensated or problem.n < self.n)
         self._scipy = self._scipy_solver(start) if plain else None
         self.h_previous: float | None = None
@@ -253,7 +253,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run.work.K[0] = self.f
         run.schedule = bare_schedule(run.stepping.span, float(self.h_abs or 0.0))
         run.schedule.place[PENDING] = 1  # the solver shows the end of the last step
-        self._engine = run.engine(run.problem.in_python(run, by_address=True), begins=begins)
+        self._engine = run.engine(run.problem.in_python(run), begins=begins)
 
     def _settle(self) -> None:
         """Store the attributes after a step, so that the next step detects which of them the user has set."""
@@ -356,7 +356,7 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         run.attach(self.diagnostics)
         if scipy is None:
             run.work.rates[0] = run.work.rates[-1]
-            self._engine = run.engine(problem.in_python(run, by_address=True), begins=False)
+            self._engine = run.engine(problem.in_python(run), begins=False)
         elif self._SCIPY is not None:
             self._scipy = self._SCIPY(problem.derivative, begin.t, begin.y, begin.t + 1.0, first_step=1.0)
             self._scipy.fun = self._evaluate
@@ -408,8 +408,6 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
                     "give atol > 0"
                 )
             return False, message
-        # SciPy keeps the value itself, and a user's function may return the same buffer again.
-        solver.f = solver.f.copy()
         solver.t_old = self.t
         self.y_old, self.y, self.t = self.y, solver.y, solver.t
         self.f, self.h_abs, self.h_previous = solver.f, solver.h_abs, solver.h_previous

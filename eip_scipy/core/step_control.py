@@ -66,10 +66,11 @@ class StepControl(NamedTuple):
         _check_kind(name, method, h, first_step, max_step)
         first_step, max_step = _bounds(first_step, max_step, abs(t_bound - t0))
         unset = h is not None and isinstance(atol, DefaultTolerance)
+        is_loose = isinstance(rtol, float) and rtol >= LEAST_RTOL
         rtol, atol = _tolerance("rtol", rtol, n), _tolerance("atol", 0.0 if unset else atol, n)
         sign = -1.0 if t_bound < t0 else 1.0
         if h is None:
-            if (rtol < LEAST_RTOL).any():
+            if not is_loose and (rtol < LEAST_RTOL).any():
                 text = f"At least one element of `rtol` is too small. Setting `rtol = np.maximum(rtol, {LEAST_RTOL})`."
                 warnings.warn(text, stacklevel=users_level())
                 rtol = np.maximum(rtol, LEAST_RTOL)
@@ -89,7 +90,6 @@ class StepControl(NamedTuple):
             return min(self.h, length) if length else self.h
         if self.first_step is not None:
             return self.first_step
-        self.require_scale(y0)
         return self._estimate(rhs, y0, f0, method.error_estimator_order or 0)
 
     def _estimate(self, rhs: Callable[[float, Array], Array], y0: Array, f0: Array, order: int) -> float:
@@ -98,13 +98,12 @@ class StepControl(NamedTuple):
         `order` is that of the error estimate. The result is NaN if the derivative `f0` is not finite, 0 for an interval
         of length 0, and infinite for a state without components.
         """
-        span = self.span
+        span, scale = self.span, self.scale(y0)
         if y0.size == 0:
             return math.inf
         length = abs(span.t_bound - span.t0)
         if length == 0.0:
             return 0.0
-        scale = self.atol + np.abs(y0) * self.rtol
 
         def size(x: Array) -> float:
             return float(np.linalg.norm(x / scale)) / math.sqrt(x.size)
@@ -132,14 +131,15 @@ class StepControl(NamedTuple):
         length = abs(self.span.t_bound - self.span.t0)
         return max(tau, min(PART_OF_MOTION * motion, length, self.span.max_step))
 
-    def require_scale(self, y0: Array) -> None:
-        """Raise an error if the error of a component has no scale at the start."""
-        none = np.flatnonzero(self.atol + self.rtol * np.abs(y0) == 0)
-        if none.size:
+    def scale(self, y0: Array) -> Array:
+        """Return the unit (n,) of the error of each component at the start; raise an error if it is 0."""
+        scale = self.atol + np.abs(y0) * self.rtol
+        if np.count_nonzero(scale) < scale.size:
             raise ValueError(
-                f"the error of component {none[0]} has no scale, because y0 and `atol` are 0 there. Give atol > 0, or "
-                "a fixed step h."
+                f"the error of component {scale.argmin()} has no scale, because y0 and `atol` are 0 there. Give atol "
+                "> 0, or a fixed step h."
             )
+        return np.asarray(scale)
 
 
 def _check_kind(name: str, method: Method, h: Any, first_step: Any, max_step: Any) -> None:

@@ -422,6 +422,21 @@ LIBRARY: dict[Any, Any] = ...
 def are_finite(numbers: numpy.typing.NDArray[numpy.float64]) -> bool:
     """Return True if no number is NaN or infinite."""
 
+class RightHandSide:
+    """
+    The right-hand side of a run, from a `Call` of the function, which returns the accelerations if the equations are of `second_order`.
+    """
+
+    def __init__(self, call: object, n: int, is_complex: bool, second_order: bool) -> None: ...
+
+    def __call__(self, t: object, y: object) -> numpy.ndarray:
+        """Return the derivative (n,) at (t, y), a new array."""
+
+    def derivatives(self, times: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+        """
+        Return the derivatives (m, n) at times (m,) and states (m, n); NaN where the function raises an exception.
+        """
+
 class InvariantFunctions:
     """The invariants of a run and their gradients, each as a `Call`."""
 
@@ -458,6 +473,36 @@ CHECK_NOISE: float = 6.0
 INVARIANCE_TOLERANCE: float = 1e-08
 TIME_SHARE: float = 0.01
 TIME_ROOM: float = 5.0
+
+def time_of_motion(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> float:
+    """
+    Return the time in which a state changes by its own size; infinite if it or its derivative `f` is 0.
+    """
+
+def typical_sizes(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], tau: float) -> numpy.ndarray:
+    """
+    Return for each component a size that is added to |y_k|, so that shifts do not vanish with the component: ``abs(tau * f[k])``, the motion in a step of length `tau`, and at least 1e-3 |y_k|. If both are 0, it is the largest size of the other components, or 1 if all are 0.
+    """
+
+def is_canonical(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> bool:
+    """
+    Return True if a state y with the derivative f is taken as (q, p): it is real and has an even number n of components, ``f[: n // 2]`` and ``p = y[n // 2 :]`` are both zero or both nonzero, and the sum of ``f[: n // 2] * sign(p)`` is not negative.
+    """
+
+def states_near(y: numpy.typing.NDArray[numpy.inexact], sizes: numpy.typing.NDArray[numpy.float64], ways: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:
+    """
+    Return the states ``y + ways * sizes``, (m, n). Components that are 0 at y become positive.
+    """
+
+def are_independent(F: numpy.typing.NDArray[numpy.float64]) -> bool:
+    """
+    Return True if the columns of F (m, n), with rows and then columns in units of their largest entries, are clearly independent; False too if there are more than 24 columns, or a number is not finite.
+    """
+
+def raise_residuals(largest: numpy.typing.NDArray[numpy.float64], values: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64]) -> None:
+    """
+    Raise `largest` (l,) to the distances of the values (m, l) from the target (l,); NaN does not count.
+    """
 
 class FailedCallError(Exception): ...
 

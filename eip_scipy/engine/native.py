@@ -30,8 +30,8 @@ class Call(NamedTuple):
     used directly if it is an array of the shape `shape` (a float for ``()``) and of the dtype of the state (float if
     `real`). ``convert(value, t)`` converts any other value to such an array, or raises an error.
 
-    The attribute ``address`` of `compiled` is that of a C function ``int (t, y, out, params)`` made from ``fun(t, y)``,
-    which is called instead of it. The function itself is called if the C function returns another status than 0.
+    The C function `compiled` (see `ByAddress` in `core.functions`) is called instead of `fun` if there is one. `fun` is
+    called if the C function returns another status than 0.
     """
 
     fun: Callable[..., Any]

@@ -9,6 +9,7 @@ cpp/trust.hpp); this module interprets them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -28,8 +29,8 @@ TOO_FAR, FAR_OFTEN = 5 / 3, 0.01
 ROUNDING_OF_RATES, ROUNDING_OF_DIFFERENCES = 1e-11, 1e-7
 # Smallest number of projections for which fractions and sums are judged, if more than one correction is LARGE.
 ENOUGH = 5
-# Counts and shares that are 0 unless a step was suspicious.
-SUSPICIOUS = [data.SHARE, data.RAW, data.RAW_MANY, data.MANY]
+# Figures of corrections, and counts and shares that are 0 unless a step was suspicious.
+JUDGED_FIRST = itemgetter(data.NU, data.SUM, data.EXPECTED, data.SHARE, data.RAW, data.RAW_MANY, data.MANY)
 MOST_REASONS = 3  # largest number of reasons in a message
 PAGE = '"When a run is not trusted" (docs/explanation/trust.md)'
 
@@ -60,25 +61,11 @@ class Trust:
     @property
     def exceeds_bounds(self) -> bool:
         """Return True if the corrections or errors of an invariant do not occur in correct runs."""
-        return bool(exceed_bounds(self.figures).any())
+        return not all(map(_is_ordinary, self.figures.tolist())) and bool(exceed_bounds(self.figures).any())
 
-    @property
-    def beyond_doubt(self) -> bool:
-        """Return True if later projections cannot make the run reliable again."""
-        return self.exceeds_bounds and bool(_extreme(self.figures).any())
-
-    @property
-    def worst(self) -> tuple[str, float, float] | None:
-        """Return invariant, time and size in local errors of the largest correction; None if none was measured."""
-        if not np.any(self.figures[:, data.JUDGED] > 0):
-            return None
-        k = int(np.argmax(self.figures[:, data.NU]))
-        return self.names[k], float(self.figures[k, data.AT]), float(self.figures[k, data.NU])
-
-    @property
-    def corrections(self) -> np.ndarray:
-        """Size in local errors of each invariant's largest correction, (l,); nan where none was measured."""
-        return np.where(self.figures[:, data.JUDGED] > 0, self.figures[:, data.NU], np.nan)
+    def is_doubtful(self, ended: bool = False) -> bool:
+        """Return True if the figures show that the run is faulty, before its end without hope of recovery."""
+        return self.exceeds_bounds and (ended or bool(_extreme(self.figures).any()))
 
     def followed_by(self, other: Trust) -> Trust:
         """Return the combined record of this run and of the run `other` that continued it."""
@@ -106,9 +93,9 @@ class Trust:
 
         There is one for each of the worst three invariants, and one that counts the other invariants.
         """
-        found = np.flatnonzero(exceed_bounds(self.figures))
-        if not found.size:
+        if not self.exceeds_bounds:
             return []
+        found = np.flatnonzero(exceed_bounds(self.figures))
         rows = self.figures[found]
         shares = (rows[:, data.NU] / BEYOND_DOUBT, rows[:, data.RAW] / TOO_FAR, rows[:, data.SHARE] / data.LARGE_SHARE)
         worst = found[np.argsort(-np.max(shares, axis=0), kind="stable")]
@@ -132,11 +119,14 @@ class Trust:
 
 def exceed_bounds(figures: np.ndarray) -> np.ndarray:
     """Return a mask of the rows of figures (..., N_FIGURES) that do not occur in correct runs."""
-    large = (figures[..., data.NU] > BEYOND_DOUBT) | (figures[..., data.SUM] > TOGETHER * figures[..., data.EXPECTED])
-    if not (np.count_nonzero(large) or np.count_nonzero(figures[..., SUSPICIOUS])):  # as in most runs
-        return large
     far = figures[..., data.RAW_MANY] > FAR_OFTEN * figures[..., data.NOTED]
     return _extreme(figures) | (_may_leak(figures) & _large_corrections(figures)) | far
+
+
+def _is_ordinary(row: list[float]) -> bool:
+    """Return True if a row of figures is within the bounds at a glance, as in most runs."""
+    nu, total, expected, *suspicious = JUDGED_FIRST(row)
+    return nu <= BEYOND_DOUBT and total <= TOGETHER * expected and not any(suspicious)
 
 
 def suspects(figures: np.ndarray, suspect: np.ndarray) -> np.ndarray:

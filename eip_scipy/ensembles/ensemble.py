@@ -429,7 +429,7 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
     holds = len(C) > 0 and (len(first) == 1 or ready.problem.variations is None)
     if holds and len(first) > 1:
-        y = np.array([states_near(start, np.abs(start), [NEAR_DISTANCE])[0] for start in everyone.y0s[first]])
+        y = np.array([states_near(start, np.abs(start), (NEAR_DISTANCE,))[0] for start in everyone.y0s[first]])
         f, own = np.full(y.shape, np.nan), parameters.copy()
         for k, member in enumerate(first):
             parameters[:] = everyone.params[member]

@@ -27,7 +27,7 @@ from ..engine.trust import Trust, exceed_bounds, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
 from ..run.prepare import RunArguments, prepared
-from ..run.results import IntegrationResult
+from ..run.results import IntegrationResult, described
 from .result import COUNTERS, FAILED, MEMBER_FIELDS, NOT_RUN
 
 __all__ = ["LANES", "Chunk", "Plan", "Task", "placed", "run_chunk"]
@@ -177,14 +177,15 @@ class Plan:
             if status == FAILED:
                 driver.save_now()
                 y = driver.y[driver.rows - 1]
-            values[: driver.rows] = driver.values().T
+            values[: driver.rows] = driver.values()
             at_end[:] = driver.values_at(np.array([t]), y[None].copy())
-        driver.note(values[: driver.rows].T, target)
+        driver.note(values[: driver.rows], target)
         rows = min(driver.rows, self.times.size)
         rows = int(np.cumprod(driver.t[:rows] == self.times[:rows]).sum())  # the last one may be of an early end
         padding = ((0, 0), (0, self.times.size - rows))
+        message = described(message, driver.run.diagnostics, loop.notes())
         found = {
-            "y": y, "t": t, "status": status, "message": loop.explained(message), "target": target,
+            "y": y, "t": t, "status": status, "message": message, "target": target,
             "trusted": driver.run.trust.trusted and status >= 0, "max_residual": driver.run.work.max_residual,
             "max_correction": loop.driver.run.diagnostics.max_correction, "end_invariants": at_end,
             "trajectories": np.pad(driver.y[:rows].T, padding, constant_values=np.nan),
@@ -318,7 +319,7 @@ class BatchRunner:
                     found.append(examiner.finding(derivative, float(out["t"][k]), out["y"][k]))
                     at_ends = found[-1] is not None
                 trust.doubts += list(filter(None, found))[:1]
-            if run.options.adaptive and trust.beyond_doubt:
+            if run.options.adaptive and trust.is_doubtful():
                 out["status"][k] = NOT_RUN  # alone it may end early
             elif not trust.trusted:
                 out["trusted"][k] = False

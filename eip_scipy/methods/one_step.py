@@ -10,9 +10,8 @@ import numpy as np
 
 from ..core.derivatives import random_directions, time_of_motion, unless_error
 from ..core.inputs import as_vector
-from ..core.projection import is_canonical
 from ..engine.data import EPS, NFEV, Work
-from ..engine.native import Hooks
+from ..engine.native import BUILD, Hooks
 from .base import Method
 from .runge_kutta import check_integer
 
@@ -160,7 +159,7 @@ class OneStep(Method):
         motion = tau if motion == np.inf else motion
         h, last = sign * min(SHORT * motion, tau), np.full_like(y, np.nan)
         is_real = y.dtype.kind == "f"
-        parts = 2 if is_canonical(y, f) or (is_real and y.size == 2) else 1
+        parts = 2 if BUILD.is_canonical(y, f) or (is_real and y.size == 2) else 1
 
         def norms(x: Array) -> Array:
             return np.linalg.norm(x.reshape(parts, -1), axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -17,7 +17,7 @@ from ..core.inputs import is_number, shown
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED
 from ..engine.data import PENDING, ROW, STEP, TIME, TIME_NEW, Members, Schedule
-from ..engine.native import FailedCallError, NativeFunctions, PythonFunctions
+from ..engine.native import BUILD, FailedCallError, NativeFunctions, PythonFunctions
 
 __all__ = ["Driver", "check_bytes", "check_memory", "expected_steps", "require_memory", "saved_rows"]
 
@@ -72,21 +72,18 @@ class Driver:
         interpolants = self.interpolants
         if interpolants is not None:
             interpolants.record.left[:] = self._events.left
-        with self.own_errors():
-            try:
-                code = self.engine.advance(k_end, self.state, self.new, self.t, self.y, self._segments)
-            finally:
-                if interpolants is not None:
-                    self._events.take(*interpolants.roots())
-        return int(code)
+        try:
+            return int(self._call(self.engine.advance, k_end, self.state, self.new, self.t, self.y, self._segments))
+        finally:
+            if interpolants is not None:
+                self._events.take(*interpolants.roots())
 
     def sweep(self, members: Members, steps: int) -> int:
         """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
 
         Return `OK`, also if more calls are needed, or the code of what happened to the current member.
         """
-        with self.own_errors():
-            code = int(self.engine.sweep(members, steps, self.state, self.new, self.t))
+        code = int(self._call(self.engine.sweep, members, steps, self.state, self.new, self.t))
         self.warn()
         return code
 
@@ -97,6 +94,15 @@ class Driver:
         """
         self.engine.sweep_octets(members, steps, self.state, self.new, self.t)
         self.warn()
+
+    def _call(self, function: Callable[..., Any], *given: Any) -> Any:
+        """Return ``function(*given)``, of the engine, with the errors of `own_errors`."""
+        try:
+            return function(*given)
+        except FailedCallError as error:
+            failed = error
+        with self.own_errors():
+            raise failed
 
     @contextmanager
     def own_errors(self) -> Iterator[None]:
@@ -204,20 +210,18 @@ class Driver:
         return solution(self.interpolants, self._segments[: self._kept], t_end, self.now[1])
 
     def note(self, values: np.ndarray, target: np.ndarray) -> None:
-        """Update the largest errors (l,) with the `values` (l, m) at the saved states except the start."""
-        errors = np.abs(values[:, self.t[: self.rows] != self.schedule.span.t0].T - target)
-        largest = self.run.work.max_residual
-        np.fmax(largest, np.fmax.reduce(errors, axis=0, initial=0.0), out=largest)  # NaN does not count
+        """Update the largest errors (l,) with the `values` (m, l) at the saved states except the start."""
+        first = int(self.rows > 0 and self.t[0] == self.schedule.span.t0)
+        BUILD.raise_residuals(self.run.work.max_residual, values[first:], target)
 
     def values(self) -> np.ndarray:
-        """Return the invariants of the saved states, (l, m)."""
-        return self.values_at(self.t[: self.rows], self.y[: self.rows]).T
+        """Return the invariants of the saved states, (m, l)."""
+        return self.values_at(self.t[: self.rows], self.y[: self.rows])
 
     def values_at(self, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
         """Return the invariants (m, l) of states (m, n), each with its own `params` (m, p) if these are given."""
         out = np.empty((len(t), self.run.invariants.size))
-        with self.own_errors():
-            self.engine.values(t, y, out, *params)
+        self._call(self.engine.values, t, y, out, *params)
         return out
 
 
@@ -243,8 +247,9 @@ def expected_steps(schedule: Schedule) -> int:
 def check_memory(rows: int, run: Run, max_bytes: float | None) -> None:
     """Raise MemoryError if `rows` saved states of the run would need more memory than `max_bytes` allows."""
     needed = rows * (run.y0.nbytes + 8.0 * (1 + run.invariants.size))
-    what = f"saving {rows:.3g} states of {run.y0.size} components needs"
-    require_memory(needed, what, max_bytes, "increase save_every or max_bytes")
+    if needed > SMALL or max_bytes is not None:
+        what = f"saving {rows:.3g} states of {run.y0.size} components needs"
+        require_memory(needed, what, max_bytes, "increase save_every or max_bytes")
 
 
 def require_memory(needed: float, what: str, max_bytes: float | None, advice: str) -> None:

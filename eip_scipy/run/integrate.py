@@ -230,7 +230,11 @@ def integrate(
     begin = time.perf_counter()
     with opened as keeper:
         try:
-            return Loop(prepared(request), request, keeper).run()
+            functions = fun, acceleration, getattr(fun, "rhs", None)
+            compiles = compiled is not False and any(map(is_jitted, functions))
+            with progress_bar(progress is True and compiles, lambda: COMPILING):
+                loop = Loop(prepared(request), request, keeper)
+            return loop.run()
         except BaseException as error:
             if not hasattr(error, "partial"):
                 _attach_start(error, request, time.perf_counter() - begin)
@@ -251,10 +255,8 @@ class Loop:
                 f"checkpoint: a file cannot store the internal state of SciPy's {run.method.name}, which resuming "
                 "needs. Omit checkpoint, or save the last state of a run and start another run from it."
             )
-        compiles = given.compiled is not False and is_jitted(problem.fun)
-        with progress_bar(given.progress and compiles, lambda: COMPILING):
-            functions, self.why_not = problem.functions(run, given.compiled)
-            self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
+        functions, self.why_not = problem.functions(run, given.compiled)
+        self.driver = Driver(run, functions, keeps_steps=given.dense_output, max_bytes=given.max_bytes)
         if keeper is not None:
             own = identity(run, run.begin.y, problem.parameters)
             keeper.begin(self.driver, own, problem.derivative, self.events)
@@ -298,23 +300,25 @@ class Loop:
         self._doubtful |= self.driver.run.look(self.driver.step, ended, t, y.copy())
 
     def _steps(self, bar: Any) -> tuple[int, str]:
-        driver, schedule = self.driver, self.driver.schedule
-        if driver.step == 0:
+        driver, schedule, step = self.driver, self.driver.schedule, self.driver.step
+        if step == 0:
             t0, times = schedule.span.t0, schedule.t_eval
             if driver.rows == 0 and (times.size == 0 or times[0] == t0):
                 driver.save(t0, driver.state)
             if self._stopped_by_callback(0):
                 return 1, STOPPED
         while True:
-            if driver.step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
+            if step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
                 return -1, used_up(self._most_steps, driver.now[0])
             if self.keeper is not None:
                 self.keeper.keep()
-            rows, steps, begin = driver.rows, self._next_steps(), time.perf_counter()
-            code = driver.advance(driver.step + steps)
-            seconds = time.perf_counter() - begin
+            rows, steps, begin = driver.rows, self._next_steps(step), time.perf_counter()
+            code = driver.advance(step + steps)
+            seconds, step = time.perf_counter() - begin, driver.step
             driver.warn()
-            self._warn_of_interpreted_invariants(seconds)
+            self._seconds += seconds
+            if self._seconds > SLOW_SECONDS:
+                self._warn_of_interpreted_invariants()
             self._event_ended = self._pause() if code == PAUSE else code == ENDED
             if self._event_ended and schedule.t_eval.size == 0:
                 driver.cut(*self.events.last)
@@ -326,9 +330,9 @@ class Loop:
                 return 1, ENDED_BY_EVENT
             if code not in (OK, PAUSE, FULL):
                 return -1, failure(code, driver.run, schedule.clock)
-            if is_check_due(driver.step) or driver.run.work.suspect[REASON] != NOTHING:
+            if is_check_due(step) or driver.run.work.suspect[REASON] != NOTHING:
                 self._check()
-                if slowed := driver.run.slowed(driver.step, *driver.now):
+                if slowed := driver.run.slowed(step, *driver.now):
                     self._ended_early = True
                     return -1, slowed
             if code == FULL:
@@ -336,34 +340,31 @@ class Loop:
             elif code == OK and schedule.clock[TIME] == schedule.span.t_bound:
                 return 0, ARRIVED
             elif code == OK:
-                # At most a doubling, so that one fast chunk cannot make a slow one long; none of one that was cut.
-                longer = max(self._chunk, 8 * steps)
+                # At most ten times as many, so that one fast chunk cannot make a slow one long.
+                longer = max(self._chunk, 10 * steps)
                 self._chunk = max(1, min(longer, int(steps * CHUNK_SECONDS / max(seconds, 1e-9))))
 
-    def _next_steps(self) -> int:
-        """Return the number of steps to make next: at most `_chunk`, and none beyond the next check of the run.
+    def _next_steps(self, step: int) -> int:
+        """Return the number of steps to make after `step`: at most `_chunk`, and none beyond the next check of the run.
 
         With a callback, no step goes beyond the next state that is saved. Near the end of a multistep run it is instead
         the number of all remaining steps, because each of the last states that is requested costs a step of the
         starting method.
         """
         driver, schedule, span = self.driver, self.driver.schedule, self.driver.schedule.span
-        history, left = driver.run.stepper.multistep, span.n_steps - driver.step
+        history, left = driver.run.stepper.multistep, span.n_steps - step
         chunk = left if history is not None and left - history.middle <= self._chunk else self._chunk
-        chunk = max(1, min(chunk, steps_to_check(driver.step), self._most_steps - driver.step))
+        chunk = max(1, min(chunk, steps_to_check(step), self._most_steps - step))
         if self.given.callback is None:
             return chunk
         if schedule.t_eval.size:
             times = schedule.t_eval[driver.rows :]
             known = span.h != 0.0 and times.size  # adaptive steps are made one by one
             return max(1, min(chunk, int(abs((times[0] - driver.now[0]) / span.h)))) if known else 1
-        return min(chunk, schedule.save_every - driver.step % schedule.save_every) if schedule.save_every else chunk
+        return min(chunk, schedule.save_every - step % schedule.save_every) if schedule.save_every else chunk
 
-    def _warn_of_interpreted_invariants(self, seconds: float) -> None:
-        """Warn once if only the invariants prevent a slow run from being compiled; `seconds` is the time of a chunk."""
-        self._seconds += seconds
-        if self._seconds <= SLOW_SECONDS:
-            return
+    def _warn_of_interpreted_invariants(self) -> None:
+        """Warn once if only the invariants prevent a slow run from being compiled."""
         self._seconds, run = -math.inf, self.driver.run
         if self.given.compiled is not None or self.driver.functions.native or not is_jitted(run.problem.fun):
             return
@@ -415,30 +416,35 @@ class Loop:
         driver, run, events = self.driver, self.driver.run, self.events
         if status < 0:
             driver.save_now()
-        values, target = np.full((run.invariants.size, driver.rows), np.nan), run.invariants.fixed_target
-        with suppress(BaseException) if broken else nullcontext():
+        try:
             values = driver.values()
+        except BaseException:
+            if not broken:
+                raise
+            values = np.full((driver.rows, run.invariants.size), np.nan)
+        target = run.invariants.fixed_target
         driver.note(values, target)
+        at_events, self.remarks = event_derivatives(run.problem, driver.schedule.span.t0, events.t, events.y)
+        notes = self.notes()
         t, y = events.last if self._event_ended else driver.now
         sol, asked, kept = driver.solution(t), self.given, run.invariants.with_targets
         variations = run.problem.variations
         if variations is not None:
             sol = None if sol is None else StateSolution(sol, run.tangents)
             asked = asked._replace(variations=run.tangents.restarted(y))
-        at_events, self.remarks = event_derivatives(run.problem, driver.schedule.span.t0, events.t, events.y)
         result = assembled(
             run,
             driver.y[: driver.rows],
             (events.t, events.y) if events.functions else None,
             run.work.counters,
             t=driver.t[: driver.rows],
-            invariants=values,
+            invariants=values.T,
             target=target,
             max_residual=run.work.max_residual,
             diagnostics=run.diagnostics,
             sol=sol,
             status=status,
-            message=self.explained(message),
+            message=described(message, run.diagnostics, notes),
             success=status >= 0,
             trusted=run.trust.trusted,
             wall_time=time.perf_counter() - self._begin,
@@ -447,29 +453,25 @@ class Loop:
             h=abs(driver.schedule.span.h) or None,
             **at_events,
         )
-        last, at_end = (np.array([t]), y[None].copy()), not self._event_ended
-        arguments = asked._asdict() | {"params": copy(asked.params)}  # the user may change the array
-        arguments |= arguments.pop("projection")
+        last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
+        arguments = {**asked._asdict(), **asked.projection, "params": copy(asked.params)}  # the user may change it
+        del arguments["projection"]
         figures, rows = run.trust.figures, slice(driver.rows - 1, driver.rows)
         saved = driver.rows > 0 and driver.t[rows] == t and np.array_equal(driver.y[rows], y[None])
         origin = Origin(
             arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign, tuple(run.invariants.names),
             terms=np.where(np.isnan(target), np.inf, figures[:, START]),  # balances have no target
-            before=values[:, -1].copy() if saved else None,
+            before=values[-1].copy() if saved else None,
             event=events.last_index if self._event_ended else None,
             kept=lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
-            values=lambda: driver.values_at(*last)[0],
+            values=lambda: values_at(*last)[0],
             derivative=lambda: run.tangents.state(run.problem.derivative(t, last[1][0])),
-            ended=message, notes=self._notes(),
+            ended=message, notes=notes,
         )  # fmt: skip
         object.__setattr__(result, "_origin", origin)  # not a field: fields are items of the result
         return result
 
-    def explained(self, message: str) -> str:
-        """Return the message with remarks: on a start that was moved, on doubts about the run, and notes."""
-        return described(message, self.driver.run.diagnostics, self._notes())
-
-    def _notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[str, ...]:
         """Return notes on checkpoints, functions that were not compiled and gradients by differences."""
         run = self.driver.run
         notes = [*(() if self.keeper is None else self.keeper.notes), self.why_not]

@@ -181,9 +181,11 @@ def as_problem(given: RunArguments, method: Method, solver: Any) -> tuple[BoundP
         projection = replace(projection, invariants=variations.invariants)
     elif given.jvp is not None or given.symplectic is not None:
         raise TypeError("jvp and symplectic need variations=...; pass variations, or omit jvp and symplectic.")
+    functions = [fun, *(item.function for item in projection.invariants)]
     return BoundProblem(
-        fun, y0, form, extra, problem=own, events=Events(events, extra), acc=acc, jacobian=jacobian,
+        fun, y0, form, extra, problem=own, events=Events(events, extra) if events else None, acc=acc, jacobian=jacobian,
         jac=Jacobian(given.jac), variations=variations, explains=True,
+        by_address=given.compiled is not False and all(map(is_jitted, functions)),
     ), projection  # fmt: skip
 
 

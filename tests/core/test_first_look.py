@@ -64,7 +64,7 @@ def test_what_is_found_in_order_passes_the_examination(case):
         for scale in (1e-3, 1.0, 1e4):
             t, y = rng.uniform(0, 10), scale * rng.standard_normal(2)
             f = fun(t, y)
-            known = InvariantSet(item, t, y, f, TAU, t_bound=t + 5.0, rhs=fun)
+            known = InvariantSet(item, t, y, f, TAU, t_bound=t + 5.0)
             at = t, y, f, known.gradients(t, y, f), known.values(t, y), TAU, known.t_span, random_directions(2, False)
             in_order.append(known.functions.is_in_order(*at))
             known.functions = Unsure(known.functions)

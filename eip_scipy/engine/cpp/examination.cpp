@@ -278,12 +278,76 @@ class InvariantFunctions {
     std::vector<PythonCall> inv_, grad_;
 };
 
+// The right-hand side of a run as Python calls it. If it is of second order, the function returns the accelerations.
+class RightHandSide {
+  public:
+    RightHandSide(nb::handle call, int64_t n, bool is_complex, bool second_order)
+        : type_(is_complex ? static_cast<int>(NPY_CDOUBLE) : static_cast<int>(NPY_DOUBLE)),
+          n_(n),
+          half_((second_order ? n / 2 : 0) * (is_complex ? 2 : 1)) {
+        const int64_t m = is_complex ? 2 * n : n;
+        require(function_.emplace_back(call, type_, second_order ? n / 2 : n, kept_).floats() == m - half_,
+                "rhs must give as many numbers as the state has");
+    }
+
+    Array derivative(nb::handle time, nb::handle y) {
+        const Array state = owned<Array>(PyArray_FROMANY(y.ptr(), type_, 1, 1, NPY_ARRAY_CARRAY_RO));
+        require(kept_.is_valid() && state.size() == n_, "rhs: y has another size than the state of the run");
+        Array out = new_array({n_}, type_);
+        evaluate(nb::cast<double>(time), state.floats(), out.floats(), out, time);
+        return out;
+    }
+
+    Array derivatives(Numbers times, Rows y) {
+        require(kept_.is_valid() && y.type == type_ && y.shape[1] == n_ && y.shape[0] == times.shape[0],
+                "rhs: expected the dtype and the size of the run, and one time for each state");
+        Array out = new_array({y.shape[0], n_}, type_);
+        const int64_t m = n_ * (type_ == NPY_CDOUBLE ? 2 : 1);
+        for (int64_t k = 0; k < y.shape[0]; ++k) {
+            double *f = out.floats() + k * m;
+            try {
+                evaluate(times.data[k], y.data + k * m, f, out, nb::float_(times.data[k]));
+            } catch (nb::python_error &error) {
+                if (!error.matches(PyExc_Exception) || error.matches(PyExc_MemoryError)) throw;
+                fill(f, NOT_A_NUMBER, m);
+            }
+        }
+        return out;
+    }
+
+    nb::handle kept() const { return kept_; }
+    void clear() {
+        function_.clear();
+        kept_.reset();
+    }
+
+  private:
+    void evaluate(double t, const double *y, double *f, nb::handle owner, nb::handle time) const {
+        copy(y + half_, f, half_);
+        function_.front()(t, y, nullptr, f + half_, owner, time);
+    }
+
+    nb::list kept_;  // every object that is called
+    int type_;
+    int64_t n_, half_;
+    std::vector<PythonCall> function_;  // none after `clear`
+};
+
 bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbers.data, numbers.points); }
 
 }  // namespace
 
 void add_examination(Module module) {
     module.def("are_finite", &are_finite, "numbers"_a, "Return True if no number is NaN or infinite.");
+    Class<RightHandSide>(
+        module, "RightHandSide", nb::type_slots(Collected<RightHandSide>::slots),
+        "The right-hand side of a run, from a `Call` of the function, which returns the accelerations if "
+        "the equations are of `second_order`.")
+        .def(nb::init<nb::handle, int64_t, bool, bool>(), "call"_a, "n"_a, "is_complex"_a, "second_order"_a)
+        .def("__call__", &RightHandSide::derivative, "t"_a, "y"_a, "Return the derivative (n,) at (t, y), a new array.")
+        .def("derivatives", &RightHandSide::derivatives, "times"_a, "y"_a,
+             "Return the derivatives (m, n) at times (m,) and states (m, n); NaN where the function raises an "
+             "exception.");
     using Functions = InvariantFunctions;
     Class<Functions>(module, "InvariantFunctions", nb::type_slots(Collected<Functions>::slots),
                      "The invariants of a run and their gradients, each as a `Call`.")

@@ -451,6 +451,7 @@ NB_MODULE(EIP_MODULE, made) {
     eip::add_engine(m);
     eip::add_library(m);
     eip::add_examination(m);
+    eip::add_states(m);
     eip::add_condensates(m.def_submodule("condensates"));
     eip::add_gradients(m.def_submodule("gradients"));
     eip::add_multibody(m.def_submodule("multibody"));

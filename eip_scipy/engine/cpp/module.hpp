@@ -45,6 +45,7 @@ using Class = Guarded<nb::class_<T>>;
 
 void add_library(nb::module_ &module);
 void add_examination(Module module);
+void add_states(Module module);
 void add_condensates(Module module);
 void add_gradients(Module module);
 void add_multibody(Module module);

@@ -57,22 +57,30 @@ PythonCall::PythonCall(nb::handle description, int type, int64_t components, nb:
     }
     const nb::handle compiled = kept_attribute(description, "compiled", kept);
     if (compiled.is_none()) return;
-    require(args_.empty() && !takes_f_ && !in_place_, "engine: compiled code must be that of fun(t, y)");
-    pointer_ = reinterpret_cast<ValuePointer>(nb::cast<uintptr_t>(compiled.attr("address")));
+    pointer_ = nb::cast<uintptr_t>(compiled.attr("address"));
+    pointer_takes_f_ = truth(compiled.attr("takes_f"));
     require(pointer_, "engine: compiled code needs an address");
-    state_.resize(components_ * width_of(type_));
+    const nb::object params = compiled.attr("params");
+    require(is_plain(params.ptr(), NPY_DOUBLE, 1), "engine: params must be an array of floats");
+    params_ = nb::cast<Array>(params).floats();
+    for (std::vector<double> &state : states_) state.resize(components_ * width_of(type_));
 }
 
 // Call the compiled function; false if it raised an exception, or its value has another shape.
-bool PythonCall::by_pointer(double t, const double *y, double *out) const {
-    copy(y, state_.data(), std::ssize(state_));
-    return pointer_(t, state_.data(), out, nullptr) == 0;
+bool PythonCall::by_pointer(double t, const double *y, const double *f, double *out) const {
+    const int64_t m = std::ssize(states_[0]);
+    copy(y, states_[0].data(), m);
+    if (!pointer_takes_f_) return reinterpret_cast<ValuePointer>(pointer_)(t, states_[0].data(), out, params_) == 0;
+    if (f) copy(f, states_[1].data(), m);
+    return reinterpret_cast<GradientPointer>(pointer_)(t, states_[0].data(), states_[1].data(), out, params_) == 0;
 }
 
-void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const {
-    if (pointer_ && by_pointer(t, y, out)) return;
+void PythonCall::operator()(double t, const double *y, const double *f, double *out, nb::handle owner,
+                            nb::handle given) const {
+    if (pointer_ && by_pointer(t, y, f, out)) return;
     PyObject *arguments[5 + MOST_ARGUMENTS];  // t, y, f and out before them, and the place of the callee
-    const nb::object time_object = time(t), y_object = copied(y, components_, type_);
+    const nb::object time_object = given.is_valid() ? nb::borrow(given) : time(t),
+                     y_object = copied(y, components_, type_);
     nb::object f_object, out_object;
     size_t count = 1;  // the first place is the callee's
     arguments[count++] = time_object.ptr();

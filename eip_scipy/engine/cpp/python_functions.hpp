@@ -20,19 +20,24 @@ class PythonCall {
     // `description` has the attributes fun, args, convert, shape (of the value: () for a number), takes_f, in_place.
     PythonCall(nb::handle description, int type, int64_t components, nb::list &kept);
 
-    // y has `components` of the state's type; f too, where the function takes it. `owner`: what `out` belongs to.
-    void operator()(double t, const double *y, const double *f, double *out, nb::handle owner) const;
+    // y has `components` of the state's type; f too, where the function takes it. `owner`: what `out` belongs to. The
+    // function receives the time t as an np.float64, or as the `time` that is given.
+    void operator()(double t, const double *y, const double *f, double *out, nb::handle owner,
+                    nb::handle time = {}) const;
 
     int64_t floats() const { return floats_; }
 
   private:
-    bool by_pointer(double t, const double *y, double *out) const;
+    bool by_pointer(double t, const double *y, const double *f, double *out) const;
     bool take_list(PyObject *value, double *out) const;
     void take(PyObject *value, PyObject *t, double *out) const;
 
     nb::handle fun_, convert_;
-    ValuePointer pointer_ = nullptr;
-    mutable std::vector<double> state_;  // a copy for `pointer_`, because the function may overwrite it
+    uintptr_t pointer_ = 0;  // of a `GradientPointer` if it takes f, else of a `ValuePointer`
+    bool pointer_takes_f_ = false;
+    const double *params_ = nullptr;
+    mutable std::vector<double>
+        states_[2];  // copies of y and f for `pointer_`, because the function may overwrite them
     std::vector<nb::handle> args_;
     npy_intp dimensions_[2];
     int n_dimensions_, type_, value_type_;
