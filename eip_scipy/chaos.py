@@ -98,17 +98,18 @@ class _Orbits:
         if not 0 < abs(self.span[1] - self.span[0]) < np.inf:
             raise ValueError(f"t must be an end time or a finite interval with two different ends, got {shown(t)}.")
         self.fun, self.options, self.params = fun, options, options.pop("params", None)
-        given = states("y0s", start if y0s is None else y0s)
-        self.grid = given.shape[:-1] or np.shape(self.params)[:-1]
+        y0s = states("y0s", start if y0s is None else y0s)
+        self.grid = y0s.shape[:-1] or np.shape(self.params)[:-1]
         self.each = self.grid and np.ndim(self.params) > 1
         if self.each and np.shape(self.params)[:-1] != self.grid:
             raise ValueError(f"params must have the shape (p,) or {(*self.grid, 'p')}, got {np.shape(self.params)}.")
         self.params = np.reshape(self.params, (-1, np.shape(self.params)[-1])) if self.each else self.params
-        self.y = np.broadcast_to(given, (*self.grid, given.shape[-1])).reshape(-1, given.shape[-1]).copy()
+        self.y = np.broadcast_to(y0s, (*self.grid, y0s.shape[-1])).reshape(-1, y0s.shape[-1]).copy()
         m = len(self.y)
         self.t, self.integrals, self.trusted = np.full(m, self.span[0]), np.zeros((m, 3)), np.ones(m, bool)
         self.status, self.message, self.halvings = np.full(m, OK, object), np.full(m, "", object), np.zeros(m, int)
-        events = as_events(options.get("events", events))
+        given = options.get("events")
+        events = as_events(events if given is None else given)
         self.names = [getattr(event, "__name__", f"event {k}") for k, event in enumerate(events)]
 
     def follow(self, vectors: Array, every: Any, progress: bool, samples: int = 0) -> ChaosResult:
@@ -153,7 +154,15 @@ class _Orbits:
         params = self.params[k] if self.each else self.params
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ProjectionWarning)  # given once, at the end
-            run = ensemble(self.fun, (a, b), self.y[k], params=params, variations=self.vectors[k], **options)
+            try:
+                run = ensemble(self.fun, (a, b), self.y[k], params=params, variations=self.vectors[k], **options)
+            except (ValueError, ArithmeticError) as error:
+                if a == self.span[0]:
+                    raise
+                # All of these orbits have come to states from which no run can start.
+                self.status[k], self.message[k], self.trusted[k] = FAILED, f"{error}", False
+                self.log_sizes[k] = self.integrals[k] = np.nan
+                return
         finite, failed = np.isfinite(run.variations).all(axis=(1, 2)), run.status < 0
         Q, R = np.linalg.qr(np.where(finite[:, None, None], run.variations, self.vectors[k]))
         sizes = np.abs(np.diagonal(R, axis1=1, axis2=2))
@@ -173,7 +182,7 @@ class _Orbits:
             (s0, A0, mean), L0, (s, log_integral, rest) = self.integrals[k].T, self.log_sizes[k, 0], reduced[j].T
             # With L the logarithm of the size and A its integral, MEGNO is 2 (L - A / s).
             A = A0 + L0 * (s - s0) + log_integral
-            over_s = (A0 - L0 * s0) * np.log(s / np.where(s0 > 0, s0, s)) + L0 * (s - s0) + rest
+            over_s = (A0 - L0 * s0) * np.log(np.where(s0 > 0, s, 1) / np.where(s0 > 0, s0, 1)) + L0 * (s - s0) + rest
             self.integrals[k] = np.transpose([s, A, mean + 2 * (A - A0 - over_s)])
         self.vectors[k] = Q[j]
         self.log_sizes[k] += np.where(failed[j, None], np.nan, np.log(sizes[j]))

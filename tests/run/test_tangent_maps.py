@@ -267,11 +267,25 @@ def test_runs_that_end_early():
     assert run.t[-1] == pytest.approx(np.log(2))
     assert run.exponents == pytest.approx([1.0])
     assert run.status == "stop"
-    fails = megno(lambda t, y: y if t < 1 else y * np.nan, (0, 3), [1.0, 1.0], method=EIPRK4, h=0.1, every=0.7)
-    assert not fails.success
-    assert fails.status == "failed"
-    assert fails.t[-1] <= 1
-    assert np.isnan(fails.megno)
+    for every in (0.7, 0.5):  # within a segment, and at the start of one
+        fails = megno(lambda t, y: y if t < 1 else y * np.nan, (0, 3), [1.0, 1.0], method=EIPRK4, h=0.1, every=every)
+        assert not fails.success
+        assert fails.status == "failed"
+        assert "non-finite" in str(fails.message)
+        assert fails.t[-1] <= 1
+        assert np.isnan(fails.megno)
+
+
+def test_interrupted_runs_have_what_is_done():
+    def ends(t, y):
+        if t > 1:
+            raise KeyboardInterrupt
+        return y
+
+    with pytest.raises(KeyboardInterrupt) as info:
+        lyapunov_spectrum(ends, 2, [1.0], method=EIPRK4, h=0.1, every=0.5)
+    assert info.value.partial.t.tolist() == [0, 0.5, 1.0]
+    assert info.value.partial.lyapunov == pytest.approx(1.0, abs=1e-5)
 
 
 def test_figures():
