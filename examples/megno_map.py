@@ -1,7 +1,7 @@
 """A map of MEGNO of two planets, over the semi-major axis and the eccentricity of the second one.
 
 Both planets have 0.0001 solar masses. MEGNO is 2 for regular orbits and grows for chaotic ones; planets may also escape
-or collide. ``python examples/megno_map.py 30 10000`` draws 30 x 30 points after 10000 revolutions of the first planet
+or collide. ``python examples/megno_map.py 20 3000`` draws 20 x 20 points after 3000 revolutions of the first planet
 to megno-map.png. Where REBOUND is installed, a second map shows its variational particles, and the script prints how
 many points agree, also of REBOUND with itself from another tangent vector, and the processor time of both.
 """

@@ -37,6 +37,8 @@ __all__ = [
 PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255", "#999933")
 LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)), (0, (4, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">")
+# Orbits in maps that ended early, by status; others are white.
+ENDED = {"escaped": "#D55E00", "collided": "#CC79A7", "failed": "#777777"}
 GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
 POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 DPI = 160
@@ -142,11 +144,11 @@ def map(
         x, y, np.clip(values, least, most), cmap="viridis", vmin=least, vmax=most, shading="nearest"
     )
     others = [name for name in np.unique(status).tolist() if name != "ok"]
-    for name, color in zip(others, PALETTE[2:], strict=False):
-        cells = np.where(status == name, 1.0, np.nan)
-        axis.pcolormesh(x, y, cells, cmap=ListedColormap([color]), shading="nearest")
+    for name in others:
+        cells, colors = np.where(status == name, 1.0, np.nan), ListedColormap([ENDED.get(name, "#FFFFFF")])
+        axis.pcolormesh(x, y, cells, cmap=colors, shading="nearest")
     if others:
-        patches = [Patch(color=color, label=name) for name, color in zip(others, PALETTE[2:], strict=False)]
+        patches = [Patch(facecolor=ENDED.get(name, "#FFFFFF"), edgecolor="k", label=name) for name in others]
         axis.legend(handles=patches, fontsize="small", loc="upper right")
     label = "mean MEGNO (2: regular)" if is_megno else "largest Lyapunov exponent"
     axis.figure.colorbar(image, ax=axis, extend="max", label=label)
