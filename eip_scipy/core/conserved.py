@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,12 +13,16 @@ from scipy.linalg.lapack import dgeqp3
 from ..engine.native import BUILD, LibraryFunction
 from ..methods.base import PROJECTION_ONLY
 from .derivatives import NumericalGradient, time_of_motion, typical_sizes, unless_error
+from .invariants import Invariant
 from .particles import LinearInvariants, particle_invariants
+from .problem import component_names
 
 if TYPE_CHECKING:
     from .runs import Run
 
-__all__ = ["NEAR_DISTANCE", "NOTHING", "Conserved", "confirmed", "conserved", "reduced_rows", "states_near"]
+__all__ = [
+    "NEAR_DISTANCE", "NOTHING", "Conserved", "confirmed", "conserved", "missing_linear", "reduced_rows", "states_near",
+]  # fmt: skip
 
 # Largest state whose linear invariants are searched for: the time grows with the cube of the number of components.
 MOST_COMPONENTS = 300
@@ -130,6 +134,30 @@ def conserved(run: Run, y: Array, f: Array, names: bool) -> Conserved:
         found = unless_error(_found, samples, known, names) or NOTHING
         masses = unless_error(_masses_from_f, samples, rows) if rows else None
     return found._replace(calls=samples.calls, masses=NOTHING.masses if masses is None else masses)
+
+
+def missing_linear(run: Run) -> list[Invariant]:
+    """Return linear invariants of the equations that a run neither keeps by its corrections nor has among its own."""
+    y, n = run.begin.y, run.begin.y.size
+    if y.dtype.kind == "c" or n > MOST_COMPONENTS or run.projection.given_linear_invariants is not None:
+        return []
+    samples = _Samples(run, y, run.begin.f, True)
+    with np.errstate(all="ignore"):
+        found = unless_error(found_invariants, *samples.points) or NOTHING.linear
+        C = found.C[~found.A.any(axis=1)]
+        if len(C) and (run.invariants.size or len(run.conserved.linear.C)):
+            kept = np.broadcast_to(run.conserved.linear.C.reshape(-1, n), (NEAR, len(run.conserved.linear.C), n))
+            known = samples.gradients if run.invariants.size else kept
+            C = C[undetermined(C, np.concatenate([known, kept], axis=1), samples.sizes)]
+    names = component_names(run.problem.component_names, n)
+    return [_linear_invariant(row / row[np.flatnonzero(row)[0]], names) for row in C]
+
+
+def _linear_invariant(c: Array, names: Sequence[str]) -> Invariant:
+    """Return the invariant c y, with a name such as "y0 - 2*y1"."""
+    terms = [(value, name) for value, name in zip(c.tolist(), names, strict=True) if value]
+    text = " ".join(f"{'-' if x < 0 else '+'} {'' if abs(x) == 1 else f'{abs(x):g}*'}{name}" for x, name in terms)
+    return Invariant(lambda t, y, *_: float(c @ y), lambda t, y, *_: c, name=text.removeprefix("+ "))
 
 
 def _masses_from_f(samples: _Samples, rows: list[int]) -> Array | None:

@@ -66,11 +66,14 @@ class TangentVectors:
         """Return the places of the state; NumPy is faster with a slice."""
         return self.order[0] if self.in_halves else slice(self.n)
 
-    def augmented(self, y: Array, params: Array) -> Array:
-        """Return the augmented state of `y`, the p entries of `params` that belong to `parameters`, and `initial`."""
-        out = np.empty(self.order.size)
-        out[self.order[0]] = np.concatenate([y, params[list(self.parameters)]])
-        out[self.order[1:]] = self.initial.T
+    def augmented(self, y: Array, params: Array, vectors: Array | None = None) -> Array:
+        """Return augmented states (..., m) of `y` (..., n), the entries of `params` for `parameters`, and vectors.
+
+        The `vectors` (..., k, n + p) are rows; `initial` if they are None.
+        """
+        out = np.empty((*y.shape[:-1], self.order.size))
+        out[..., self.order[0]] = np.concatenate([y, params[..., list(self.parameters)]], axis=-1)
+        out[..., self.order[1:]] = self.initial.T if vectors is None else vectors
         return out
 
     def state(self, rows: Array) -> Array:
@@ -123,7 +126,7 @@ class TangentVectors:
             return places[indices.astype(np.intp)].astype(INDEX)
 
         vectors = EngineVectors(
-            kept=np.ascontiguousarray(G[:, places] @ self.initial), size=self.size, seen=self.n,
+            kept=np.cumsum(G[:, places, None] * self.initial, axis=1)[:, -1].copy(), size=self.size, seen=self.n,
             half=self.n // 2 if self.in_halves else 0, symplectic=self.symplectic,
         )  # fmt: skip
         blocks, kinds = (item._replace(member=moved(item.member), size=0) for item in (options.groups, options.kinds))

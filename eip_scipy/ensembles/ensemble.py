@@ -29,7 +29,7 @@ from ..core.solvers import EIPRK4, EIPSolver
 from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
 from ..run.driver import check_bytes, expected_steps, require_memory
-from ..run.prepare import DEFAULT, RunArguments, default_method
+from ..run.prepare import DEFAULT, RunArguments, default_method, prepared
 from .checkpoints import opened
 from .executors import results
 from .members import LANES, Chunk, Plan, Task, placed
@@ -150,9 +150,10 @@ def ensemble(
     **keywords
         Options of `integrate`: args (the same for all), in_place, events, compensated, compiled, metric, blocks,
         linear_invariants, direction, iterations, every, reuse_f, check, project_initial, rtol, atol, first_step,
-        max_step, variations, jvp, symplectic. Linear invariants are found at the start of the first member; they are
-        kept if they hold for the parameters of all members. Members with derivatives run one after the other, and so do
-        those with an invariant that depends on times far from 0. Events are stored for each member in
+        max_step, variations, jvp, symplectic. An array (members, n, k) as `variations` has the initial columns of each
+        member. Linear invariants are found at the start of the first member; they are kept if they hold for the
+        parameters of all members. Members with an invariant that depends on times far from 0 run one after the other,
+        and so do projected members with derivatives. Events are stored for each member in
         ``.t_events`` and ``.y_events``; a terminal event ends its member. `check` examines one member.
 
     Returns
@@ -193,15 +194,16 @@ def ensemble(
     if invariants is not DEFAULT:
         options["invariants"] = invariants
     everyone = _inputs(fun, y0s, params, options)
-    members = len(everyone.y0s)
+    members, n = everyone.y0s.shape
+    everyone, vectors = _with_vectors(everyone, options)
     request = RunArguments.of(
-        fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0], params=everyone.params[0], h=h,
-        method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
+        fun=_bare(fun), acceleration=acceleration, t_span=t_span, y0=everyone.y0s[0, :n], params=everyone.params[0],
+        h=h, method=default_method(fun) or EIPRK4 if method is None else method, save_every=save_every, t_eval=t_eval,
         **options,
     ).sendable()  # fmt: skip
     if request.args is not None or not everyone.params.shape[1]:
         request = request._replace(params=None)
-    plan = _first_that_starts(Task(request, members, reduce), everyone)
+    plan = _first_that_starts(Task(request, members, reduce, vectors), everyone)
     everyone = everyone._replace(y0s=np.ascontiguousarray(everyone.y0s, plan.dtype))
     given = fun if acceleration is None else acceleration
     size = _chunk_size(plan, members, given) if chunk is None else count("chunk", chunk)
@@ -384,6 +386,22 @@ def _inputs(fun: Any, y0s: Any, params: Any, options: dict[str, Any]) -> Chunk:
     return Chunk(0, starts, own if own.ndim == 2 else np.broadcast_to(own, (len(starts), own.size)))
 
 
+def _with_vectors(everyone: Chunk, options: dict[str, Any]) -> tuple[Chunk, int]:
+    """Return the members with the tangent vectors that each has of its own behind its state, and their number."""
+    given = options.get("variations")
+    if not (isinstance(given, np.ndarray) and given.ndim == 3):
+        return everyone, 0
+    members, n = everyone.y0s.shape
+    if given.shape[:2] != (members, n) or not given.size or given.dtype.kind not in "iuf":
+        raise ValueError(
+            f"variations: initial columns of each member must be an array of real numbers of the shape (members, n, k) "
+            f"= ({members}, {n}, k), got {given.dtype} {given.shape}."
+        )
+    options["variations"] = given[0]
+    y0s = np.concatenate([everyone.y0s, given.swapaxes(1, 2).reshape(members, -1)], axis=1)
+    return everyone._replace(y0s=y0s), given.shape[2]
+
+
 def _bare(fun: Any) -> Any:
     """Return `fun`; if it is a problem with `rhs`, only with that, because its other functions may not be picklable."""
     has_rhs = isinstance(fun, Problem) and fun.rhs is not None
@@ -399,10 +417,9 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
     errors: list[Exception] = []
     y0s, params = everyone.y0s, everyone.params
     for k in np.unique(np.linspace(0, len(y0s) - 1, TRIED).astype(int)):
-        own = None if task.request.params is None else params[k].copy()
-        tried = task._replace(request=task.request._replace(y0=y0s[k].copy(), params=own))
+        tried = task._replace(request=task.of_member(y0s[k], params[k]))
         try:
-            ready = tried.prepared(tried.request.y0, tried.request.params, check_start=True)
+            ready = prepared(tried.request)
         except MemoryError:
             raise
         except Exception as error:
@@ -413,7 +430,8 @@ def _first_that_starts(task: Task, everyone: Chunk) -> Plan:
             tried = tried._replace(doubt=(params[k].copy(), found))
         return _with_common_constraints(Plan(tried, ready), everyone)
     # A transposed y0s fails in the user's function, whose error may not explain that; jitted code explains nothing.
-    errors[0].add_note(f"ensemble: the rows of y0s are members; y0s has {len(y0s)} rows of {y0s.shape[1]} components.")
+    n = np.size(tried.request.y0)
+    errors[0].add_note(f"ensemble: the rows of y0s are members; y0s has {len(y0s)} rows of {n} components.")
     raise errors[0]
 
 
@@ -429,7 +447,8 @@ def _with_common_constraints(plan: Plan, everyone: Chunk) -> Plan:
     first = np.unique(everyone.params, axis=0, return_index=True)[1]
     holds = len(C) > 0 and (len(first) == 1 or ready.problem.variations is None)
     if holds and len(first) > 1:
-        y = np.array([states_near(start, np.abs(start), (NEAR_DISTANCE,))[0] for start in everyone.y0s[first]])
+        starts = everyone.y0s[first, : ready.problem.n]
+        y = np.array([states_near(start, np.abs(start), (NEAR_DISTANCE,))[0] for start in starts])
         f, own = np.full(y.shape, np.nan), parameters.copy()
         for k, member in enumerate(first):
             parameters[:] = everyone.params[member]

@@ -47,7 +47,7 @@ class Chunk(NamedTuple):
     """Members that run together: the number `first` of the first one, their initial states, and their parameters."""
 
     first: int
-    y0s: np.ndarray  # (m, n)
+    y0s: np.ndarray  # (m, n); (m, n + k n) if each has k tangent vectors of its own, which follow its state
     params: np.ndarray  # (m, p)
 
 
@@ -57,12 +57,18 @@ class Task(NamedTuple):
     request: RunArguments  # arguments of `integrate` for one member with a valid start
     members: int  # total number of members
     reduce: Callable[[Any], Any] | None  # function of the result of a member, whose value replaces saved states
+    vectors: int = 0  # number of tangent vectors that each member has of its own, see `Chunk`
     doubt: tuple[np.ndarray, str] | None = None  # parameters for which the checks at the start found the given fault
 
-    def prepared(self, y0: np.ndarray, params: np.ndarray, *, check_start: bool = False) -> Run:
-        """Return the run of one member, prepared as `integrate` does; without parameters if the request has none."""
-        own = None if self.request.params is None else params
-        return prepared(self.request._replace(y0=y0, params=own), check_start=check_start)
+    def of_member(self, start: np.ndarray, params: np.ndarray) -> RunArguments:
+        """Return the arguments of `integrate` for a member with a row `start` of y0s; they may have no parameters."""
+        y0, *vectors = start.reshape(1 + self.vectors, -1).copy()
+        given = self.request._replace(y0=y0, params=None if self.request.params is None else params.copy())
+        return given._replace(variations=np.transpose(vectors)) if vectors else given
+
+    def prepared(self, start: np.ndarray, params: np.ndarray) -> Run:
+        """Return the run of one member, prepared as `integrate` does, without the checks at its start."""
+        return prepared(self.of_member(start, params), check_start=False)
 
 
 class Plan:
@@ -76,7 +82,7 @@ class Plan:
 
     def __init__(self, task: Task, ready: Run | None = None) -> None:
         self.task = task
-        self.ready = task.prepared(task.request.y0, task.request.params) if ready is None else ready
+        self.ready = prepared(task.request, check_start=False) if ready is None else ready
         self.why_not: str | None = None
         self.not_batched_because = ""
         run, schedule = self.ready, self.ready.schedule
@@ -94,7 +100,6 @@ class Plan:
         loop = Loop(run, self.task.request._replace(progress=progress))
         own_starts = run.projection.project_initial or any(item.target is not None for item in invariants.items)
         reasons: dict[str, Any] = {
-            "the runs have derivatives": run.problem.variations is not None,
             "the runs have balances": invariants.balances.items,
             # The shifts of the differences depend on the start.
             "the gradient of an invariant is computed by differences": invariants.by_differences,
@@ -131,6 +136,15 @@ class Plan:
                 found[name] = [[np.zeros((0, *shape))] * self.events for _ in members]
         return found
 
+    def starts(self, y0s: np.ndarray, params: np.ndarray) -> np.ndarray:
+        """Return the states (m, size) at which runs start, with tangent vectors if they have these."""
+        if self.ready.problem.variations is None:
+            return y0s
+        if not self.task.vectors:
+            return self.ready.tangents.augmented(y0s, params)
+        rows = y0s.reshape(len(y0s), 1 + self.task.vectors, -1)
+        return self.ready.tangents.augmented(rows[:, 0], params, rows[:, 1:])
+
     def run(self, y0s: np.ndarray, params: np.ndarray, stop: threading.Event | None = None) -> dict[str, Any]:
         """Run members with the initial states `y0s` (m, n) and the parameters `params` (m, p); return their results.
 
@@ -157,7 +171,7 @@ class Plan:
             return self._idle.pop()
         except IndexError:
             request = self.task.request
-            return BatchRunner(self, Loop(self.task.prepared(request.y0, request.params), request))
+            return BatchRunner(self, Loop(prepared(request, check_start=False), request))
 
     def _alone(self, y0: np.ndarray, params: np.ndarray, watch: _Watch, unset: np.ndarray) -> dict[str, Any]:
         """Run a member as `integrate` does, and return its fields; `unset` is the state of one that did not run."""
@@ -168,8 +182,13 @@ class Plan:
         except Exception as error:
             status, message = FAILED, f"{type(error).__name__}: {error}"
         if loop is None:
-            start = self.ready.tangents.with_state(unset, y0)
-            return {"y": start, "t": self.t0, "status": status, "message": message}
+            start = self.task.of_member(y0, params).y0
+            return {
+                "y": self.ready.tangents.with_state(unset, start),
+                "t": self.t0,
+                "status": status,
+                "message": message,
+            }
         driver, target = loop.driver, loop.driver.run.invariants.fixed_target
         t, y = loop.events.last if status == 1 else driver.now
         values, at_end = np.full((driver.rows + 1, target.size), np.nan), np.full(target.size, np.nan)
@@ -221,7 +240,7 @@ class BatchRunner:
         These have failed, or need what only the loop of `integrate` does.
         """
         # Arrays that come from other processes may be read-only or not aligned, which the engine does not take.
-        y0s, params = (np.require(a, requirements=["A", "C", "W"]) for a in (y0s, params))
+        y0s, params = (np.require(a, requirements=["A", "C", "W"]) for a in (self._plan.starts(y0s, params), params))
         each = self._inputs(y0s, params, out)
         while each.where[0] < len(y0s):
             watch.update()
@@ -262,10 +281,11 @@ class BatchRunner:
         known = run.stepping.h or run.stepping.first_step
         taus, values = np.full(len(y0s), known or np.nan), np.zeros((len(y0s), len(events.functions)))
         for k, y0 in enumerate(y0s if events.functions or not known else ()):
-            derivative = self._derivative(params[k])
+            derivative, state = self._derivative(params[k]), run.tangents.state
             try:
                 f = derivative(span.t0, y0)
-                taus[k] = known or run.stepping.first(derivative, y0, f, run.method)
+                of_state = run.tangents.of_state(derivative, y0)
+                taus[k] = known or run.stepping.first(of_state, state(y0), state(f), run.method)
                 values[k] = events.at_start(span.t0, y0, f, span.sign * taus[k])
             except Exception:
                 taus[k] = np.nan
@@ -312,7 +332,8 @@ class BatchRunner:
             if at_ends or suspected[k]:
                 derivative, start = self._derivative(each.params[k]), each.starts[k]
                 run.invariants.target[:] = run.invariants.values(t0, start)
-                tau = run.stepping.scale_of_time(float(each.first_steps[k]), start, derivative(t0, start))
+                scaled = map(run.tangents.state, (start, derivative(t0, start)))
+                tau = run.stepping.scale_of_time(float(each.first_steps[k]), *scaled)
                 examiner = replace(run.examiner, tau=tau, figures=each.figures[k], largest=0.0)
                 found = [examiner.examine(each.suspects[k], derivative)] if suspected[k] else []
                 if at_ends:
@@ -450,6 +471,8 @@ def not_batched_because(driver: Driver, members: int) -> str:
         "steps are adaptive": options.adaptive,
         "the interval is infinite": schedule.span.n_steps >= UNBOUNDED,
         "the state is complex": run.y0.dtype.kind == "c",
+        "the runs have derivatives, which are projected": run.problem.variations is not None
+        and run.invariants.size > 0,
         "events may end members at different times": schedule.g.size > 0,
         "the run has fewer steps than the history of the method": history is not None and history.brief,
         "compensated=True": history is None and options.compensated,

@@ -10,27 +10,35 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 try:
     from matplotlib import pyplot, rcParams
     from matplotlib.backends.registry import BackendFilter, backend_registry
+    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
     from matplotlib.ticker import LogLocator, NullFormatter
 except ModuleNotFoundError as error:
     message = 'eip_scipy.plotting needs matplotlib: pip install "eip_scipy[plot]"'
     raise ImportError(message, name="matplotlib") from error
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["FLOOR", "MARKERS", "PALETTE", "draw_lines", "log_errors", "method_styles", "shown_figure", "typeset"]
+__all__ = [
+    "FLOOR", "MARKERS", "PALETTE", "draw_lines", "log_errors", "map", "method_styles", "shown_figure", "typeset",
+]  # fmt: skip
 
 # Colours of Okabe & Ito, Color universal design (2008), without yellow, which is too light for lines on white, and
 # wine and olive of Tol.
 PALETTE = ("#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#000000", "#777777", "#882255", "#999933")
 LINES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (3, 1)), (0, (1, 1)), "-", "--", (0, (8, 2, 1, 2)), (0, (4, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">")
+# Orbits in maps that ended early, by status; others are white.
+ENDED = {"escaped": "#D55E00", "collided": "#CC79A7", "failed": "#777777"}
 GREEK = {"alpha": "α", "beta": "β", "kappa": "κ", "Omega": "Ω"}
 POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
 DPI = 160
@@ -82,6 +90,70 @@ def draw_lines(axis: Axes, x: Any, curves: Mapping[str, Any], styles: Mapping[st
     axis.grid(alpha=0.2)
     if len(styles) > 1:
         axis.legend(fontsize="small", loc="upper right")
+
+
+def map(
+    x: Any, y: Any, found: Any, *, ax: Axes | None = None, xlabel: str = "x", ylabel: str = "y", title: str = "",
+    most: float | None = None,
+) -> Figure:  # fmt: skip
+    """Draw a map of a chaos indicator over two quantities.
+
+    Parameters
+    ----------
+    x, y : array_like, shape (k,) and (j,)
+        Values of the quantities, in ascending order.
+    found : ChaosResult or array_like, shape (j, k)
+        Result of `eip_scipy.chaos.megno` or `lyapunov_exponent` for a grid with a row for each y, or values of MEGNO.
+        Orbits that an event ended or that failed have a colour for each status, and nan has none.
+    ax : matplotlib.axes.Axes, optional
+        Axes to draw on. Default: those of a new figure.
+    xlabel, ylabel, title : str, optional
+        Labels and title.
+    most : float, optional
+        Upper end of the colour scale, which starts at 0, the MEGNO of a harmonic oscillator; values beyond have the
+        colour of the end. Default: 8 for MEGNO, the largest value for exponents, whose scale starts at the least one.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not agree, or `most` is not above 0.
+    """
+    known = isinstance(found, Mapping)
+    is_megno = not known or "megno" in found
+    values = np.array(found["megno" if is_megno else "lyapunov"] if known else found, float)
+    status = np.array(found["status"]) if known else np.full(values.shape, "ok")
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    if values.shape != (y.size, x.size):
+        raise ValueError(
+            f"found must have the shape {(y.size, x.size)}, a row for each y and a column for each x, got "
+            f"{values.shape}."
+        )
+    values[status != "ok"] = np.nan
+    if most is None:
+        most = 8.0 if is_megno else float(np.nanmax(values, initial=1e-300))
+    if not most > 0:
+        raise ValueError(f"most must be above 0, got {most!r}.")
+    axis = shown_figure(6.4, 4.6).add_subplot() if ax is None else ax
+    least = 0.0 if is_megno else float(np.nanmin(values, initial=0.0))
+    # Viridis suits colour-blind readers.
+    image = axis.pcolormesh(
+        x, y, np.clip(values, least, most), cmap="viridis", vmin=least, vmax=most, shading="nearest"
+    )
+    others = [name for name in np.unique(status).tolist() if name != "ok"]
+    for name in others:
+        cells, colors = np.where(status == name, 1.0, np.nan), ListedColormap([ENDED.get(name, "#FFFFFF")])
+        axis.pcolormesh(x, y, cells, cmap=colors, shading="nearest")
+    if others:
+        patches = [Patch(facecolor=ENDED.get(name, "#FFFFFF"), edgecolor="k", label=name) for name in others]
+        axis.legend(handles=patches, fontsize="small", loc="upper right")
+    label = "mean MEGNO (2: regular)" if is_megno else "largest Lyapunov exponent"
+    axis.figure.colorbar(image, ax=axis, extend="max", label=label)
+    axis.set(xlabel=xlabel, ylabel=ylabel, title=typeset(title))
+    return cast(Figure, axis.figure)
 
 
 class ShownFigure(Figure):

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
+from ..core.conserved import missing_linear
 from ..core.functions import AccelerationField, PointerFunction, by_pointer
 from ..core.inputs import flag, initial_state, is_number, shown
-from ..core.invariants import as_invariants
+from ..core.invariants import Invariant, as_invariants
 from ..core.names import nearest
 from ..core.particles import particle_invariants
 from ..core.problem import Problem, bind
@@ -94,6 +95,9 @@ class Recommendation:
         Reason for the choice; True if the equations are stiff, so that the method is an implicit one.
     pays : float
         Estimated time of a run of equal error without invariants, divided by that of this run; nan if there is none.
+    missing : tuple of Invariant
+        Invariants of the equations that runs with the given invariants do not keep: linear ones, and momenta of
+        particles. The recommended run keeps those that its projection would change; `reason` says so.
     """
 
     problem: Problem
@@ -106,6 +110,7 @@ class Recommendation:
     trials: tuple[Trial, ...]
     stiff: bool
     pays: float
+    missing: tuple[Invariant, ...]
 
     method = property(lambda self: self.options["method"], doc="The solver class.")
     error = property(lambda self: self.trial.error, doc="Expected error at the end of the interval.")
@@ -290,11 +295,15 @@ class _Search:
         atol = 1e-3 * rtol * min(1.0, float(np.abs(problem.y0).max()) or 1.0)
         self.first = {**common, "method": EIPDOP853, "rtol": rtol, "atol": atol}
         self.pilot = prepared(RunArguments.of(fun=problem, **self.first))
-        missing = self.pilot.conserved.missing
-        if missing is not None:
-            own = particle_invariants(missing.masses, missing.dimension)
-            common["invariants"] = (*as_invariants(common.get("invariants", problem.invariants)), *own)
+        self.missing, particles = tuple(missing_linear(self.pilot)), self.pilot.conserved.missing
+        if particles is not None:
+            self.missing = tuple(particle_invariants(particles.masses, particles.dimension))
+            common["invariants"] = (*as_invariants(common.get("invariants", problem.invariants)), *self.missing)
             self.remarks.append("Momentum and angular momentum of the particles are kept too, by particle_invariants.")
+        elif self.missing and self.pilot.invariants.size:
+            common.setdefault("linear_invariants", "auto")
+            names = ", ".join(f"{item.name}" for item in self.missing)
+            self.remarks.append(f"Linear invariants are kept too, by linear_invariants='auto': {names}.")
 
     def recommendation(self, max_nfev: int | None) -> Recommendation:
         """Return the cheapest method: an implicit one if stability makes explicit ones expensive."""
@@ -368,7 +377,7 @@ class _Search:
         reason = " ".join([self._why(way, chosen), *self.remarks, *self.notes])
         return Recommendation(
             self.problem, options, chosen, self.wanted, self.share, self.message, reason, tuple(self.trials),
-            self.stiff, pays,
+            self.stiff, pays, self.missing,
         )  # fmt: skip
 
     def _settings(self, way: _Way, value: float) -> tuple[float, dict[str, Any]]:
@@ -578,7 +587,7 @@ class _Search:
         # The times of short runs scatter: each is measured twice.
         projected, unprojected = (min(trial.seconds, self._run(trial.options)[2]) for trial in (chosen, plain))
         pays = (plain.error / chosen.error) ** (1 / way.order) * unprojected / projected
-        if pays < 0.5:
+        if pays < 0.8:  # times scatter by less than this
             self.notes.append(f"The projection does not pay: equal accuracy without it takes {pays:.2g} of the time.")
         return pays
 

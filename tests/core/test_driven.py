@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from scipy.integrate import BDF, LSODA, RK45, Radau
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_array
 
 from eip_scipy import (
     EIPBDF,
@@ -72,7 +72,9 @@ def off(y):
 
 
 @both
-@pytest.mark.parametrize("jac", [None, relaxing_jac, lambda t, y: csc_matrix(relaxing_jac(t, y))])
+@pytest.mark.parametrize(
+    "jac", [None, relaxing_jac, *(lambda t, y, kind=kind: kind(relaxing_jac(t, y)) for kind in (csc_matrix, csr_array))]
+)
 def test_without_invariants_they_take_scipy_s_steps(method, jac):
     own, plain = (ivp(m, 10, jac=jac, **TIGHT) for m in (method, SCIPY[method]))
     np.testing.assert_array_equal(own.t, plain.t)

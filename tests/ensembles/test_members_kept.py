@@ -7,7 +7,7 @@ import pytest
 from systems import same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate, load
-from eip_scipy.problems import kepler
+from eip_scipy.problems import kepler, nbody
 from eip_scipy.results import EnsembleResult, plot, save
 
 PROBLEM = kepler()
@@ -149,6 +149,33 @@ def test_reduce_gets_derivatives_and_a_projected_start():
     assert run.reduced.shape == (len(STARTS), 2, 4, 4)
     for k, alone in pairs(run, **options):
         np.testing.assert_array_equal(run.reduced[k], alone.stm[[-1, 0]])
+
+
+# Three bodies in vectors, five of which each lane is computed by itself, and members one after the other.
+COLUMN_CASES = [(3, STEPS, True), (5, STEPS, True), (3, {"method": EIPDOP853, "rtol": 1e-8, "atol": 1e-9}, False)]
+
+
+@pytest.mark.parametrize(("bodies", "options", "in_vectors"), COLUMN_CASES, ids=["3", "5", "adaptive"])
+@pytest.mark.parametrize("projected", [False, True])
+def test_each_member_has_columns_of_its_own(bodies, options, in_vectors, projected):
+    rng = np.random.default_rng(bodies)
+    angle, radius = 2.4 * np.arange(bodies), np.arange(bodies)[:, None]
+    q = radius * np.transpose([np.cos(angle), np.sin(angle), 0.1 * np.sin(3 * angle)])
+    v = np.transpose([-np.sin(angle), np.cos(angle), 0 * angle]) * (radius > 0) / np.sqrt(np.maximum(radius, 1))
+    problem = nbody([1.0, *[1e-3] * (bodies - 1)], q, v, t_span=(0, 3))
+    kept = {} if projected else {"invariants": ()}
+    starts = problem.y0 + 1e-3 * rng.standard_normal((11, 6 * bodies))
+    columns = rng.standard_normal((11, 6 * bodies, 2))
+    run = ensemble(problem, (0, 3), starts, variations=columns, t_eval=[1.0, 2.0, 3.0], **options, **kept)
+    assert run.side_by_side.all() == (in_vectors and not projected)
+    assert run.side_by_side.any() == (in_vectors and not projected)
+    for k in range(11):
+        alone = integrate(problem, (0, 3), starts[k], variations=columns[k], t_eval=[1, 2, 3], **options, **kept)
+        np.testing.assert_array_equal(run.trajectories[k], alone.y)
+        np.testing.assert_array_equal(run.variations[k], alone.variations)
+        assert (run.trusted[k], run.nfev[k]) == (alone.trusted, alone.nfev)
+    with pytest.raises(ValueError, match=r"\(11, \d+, k\), got float64 \(10, "):
+        ensemble(problem, (0, 3), starts, variations=columns[1:], **options)
 
 
 def test_what_reduce_returns():

@@ -30,6 +30,19 @@ inline void put_column(const Columns &columns, int64_t c, const double *column, 
     copy(column + cut, y + columns.second(c), columns.size - cut);
 }
 
+// Sets kept = G M at the start y of a member, by sums in the order of tangent_vectors.py.
+inline void keep_products(const Columns &columns, const Work &w, const double *y) {
+    for (int64_t i = 0; i < w.l; ++i)
+        for (int64_t c = 0; c < columns.count; ++c) {
+            const double *G = w.gradient(i);
+            double sum = 0.0;
+            for (int64_t j = 0; j < columns.cut(); ++j) sum += G[j] * y[columns.first(c) + j];
+            for (int64_t j = 0; j < columns.size - columns.cut(); ++j)
+                sum += G[columns.second(-1) + j] * y[columns.second(c) + j];
+            columns.kept[i * columns.count + c] = sum;
+        }
+}
+
 // Change a column, or a row as long, as numbers in their places in a state: itself where the places are the same.
 template <class W, class Change>
 inline void change_in_place(const Columns &columns, const W &w, double *column, const Change &change) {

@@ -265,7 +265,7 @@ void fields(Groups &g, Visit &visit) {
 // states are positions and velocities, has the first `half` floats of all first, then the others. `kept`: G M of the
 // invariants' gradients G, which is constant. symplectic: M^T J M = J is restored as well.
 struct Columns {
-    const double *kept;  // (l, count)
+    double *kept;  // (l, count)
     int64_t count, size, seen, half;
     bool symplectic;
 

@@ -89,6 +89,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     if (std::isnan(members.first_steps[k])) return false;
     system.rhs(w, t0, y, w.row(0));
     if (!evaluate_start(system, w, t0, y)) return false;
+    if (o.columns.count > 0) keep_products(o.columns, w, y);
     if (o.watched) start_figures(y, w.row(0), members.first_steps[k], run.method, run.hooks, o, w);
     copy(members.events + k * s.n_events, s.g, s.n_events);
     fill(s.rate, NOT_A_NUMBER, s.n_events);

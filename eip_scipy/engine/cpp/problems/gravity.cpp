@@ -44,7 +44,10 @@ void central(const Given<T> &g) {
 }
 
 // For a state followed by columns of derivatives.
-void variational(const Given<double> &g) { newton_variational(g.y, g.params, g.p, g.n / (6 * g.p) - 1, g.out); }
+template <class T>
+void variational(const Given<T> &g) {
+    newton_variational(g.y, g.params, g.p, g.n / (6 * g.p) - 1, g.out);
+}
 
 bool with_columns(int64_t n, int64_t p) { return p > 0 && n > 0 && n % (6 * p) == 0; }
 bool in_phase_space(int64_t n, int64_t p) { return p > 0 && n == 6 * p; }
@@ -62,7 +65,7 @@ const LibraryFunction functions[] = {
      nullptr, &RHS_WITH_ENERGY},
     {"gravity.acc", Value::ACCELERATION, 0, EIP_OF_BODIES(accelerate), at_positions, POSITIONS, acc_apart, nullptr,
      nullptr, &ACC_WITH_ENERGY},
-    {"gravity.variational", Value::DERIVATIVE, 0, plain<double, variational>, nullptr, with_columns, COLUMNS},
+    {"gravity.variational", Value::DERIVATIVE, 0, EIP_BOTH(variational), with_columns, COLUMNS},
     {"gravity.central", Value::GRADIENT_BY_F, 1, EIP_BOTH(central), at_positions_first, POSITIONS},
     {"gravity.energy", Value::NUMBERS, 1, EIP_BOTH(energy), in_phase_space, BODIES},
     {"gravity.energy_gradient", Value::GRADIENT_BY_F, 1, EIP_BOTH(gradient_of_energy), in_phase_space, BODIES},

@@ -73,25 +73,27 @@ inline void tidal_block(const double *y, const double *gm, int64_t n, int64_t fi
 }
 
 // Computes accelerations and their derivatives along the columns for fewer than four bodies.
-inline void tides_of_few(const double *y, const double *gm, int64_t n, int64_t columns, double *out) {
+template <class T>
+inline void tides_of_few(const T *y, const T *gm, int64_t n, int64_t columns, T *out) {
+    using std::sqrt;
     const int64_t half = 3 * n, size = 6 * n;
     accelerate_few(y, gm, n, out + half);
-    for (int64_t k = 1; k <= columns; ++k) std::fill(out + size * k + half, out + size * (k + 1), 0.0);
+    for (int64_t k = 1; k <= columns; ++k) std::fill(out + size * k + half, out + size * (k + 1), T(0.0));
     for (int64_t i = 1; i < n; ++i)
         for (int64_t j = 0; j < i; ++j) {
-            double x[3], r2 = 0.0;
+            T x[3], r2 = 0.0;
             for (int c = 0; c < 3; ++c) {
                 x[c] = y[3 * j + c] - y[3 * i + c];
                 r2 += x[c] * x[c];
             }
-            const double inverse = 1.0 / r2, w = inverse * std::sqrt(inverse), radial = 3.0 * w * inverse;
+            const T inverse = 1.0 / r2, w = inverse * sqrt(inverse), radial = 3.0 * w * inverse;
             for (int64_t k = 1; k <= columns; ++k) {
-                const double *a = y + size * k + 3 * i, *b = y + size * k + 3 * j;
-                double *onto_a = out + size * k + half + 3 * i, *onto_b = out + size * k + half + 3 * j;
-                const double d[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
-                const double along = radial * (x[0] * d[0] + x[1] * d[1] + x[2] * d[2]);
+                const T *a = y + size * k + 3 * i, *b = y + size * k + 3 * j;
+                T *onto_a = out + size * k + half + 3 * i, *onto_b = out + size * k + half + 3 * j;
+                const T d[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+                const T along = radial * (x[0] * d[0] + x[1] * d[1] + x[2] * d[2]);
                 for (int c = 0; c < 3; ++c) {
-                    const double change = w * d[c] - along * x[c];
+                    const T change = w * d[c] - along * x[c];
                     onto_a[c] += gm[j] * change;
                     onto_b[c] -= gm[i] * change;
                 }
@@ -116,6 +118,22 @@ inline void newton_variational(const double *y, const double *gm, int64_t n, int
     } else {
         std::vector<Tide> tides(n);
         tides_of_many(y, gm, n, columns, out, tides.data());
+    }
+}
+
+// Does so for eight members: in vectors for few bodies, otherwise one after the other.
+inline void newton_variational(const Octet *y, const Octet *gm, int64_t n, int64_t columns, Octet *out) {
+    if (n < 4) {
+        for (int64_t k = 0; k <= columns; ++k) std::copy(y + 6 * n * k + 3 * n, y + 6 * n * (k + 1), out + 6 * n * k);
+        return tides_of_few(y, gm, n, columns, out);
+    }
+    const int64_t size = 6 * n * (1 + columns);
+    std::vector<double> own(size), masses(n), found(size);
+    for (int lane = 0; lane < LANES; ++lane) {
+        for (int64_t i = 0; i < size; ++i) own[i] = y[i].lane(lane);
+        for (int64_t i = 0; i < n; ++i) masses[i] = gm[i].lane(lane);
+        newton_variational(own.data(), masses.data(), n, columns, found.data());
+        for (int64_t i = 0; i < size; ++i) reinterpret_cast<double *>(out + i)[lane] = found[i];
     }
 }
 
