@@ -31,23 +31,19 @@ def replaced(events: tuple[Callable[..., Any], ...], others: Iterable[Callable[.
     If `events` is a `ContinuedEvents`, the result is one too, with the same times in `happened`.
     """
     if isinstance(events, ContinuedEvents):
-        return ContinuedEvents(others, events.happened, moved=events.moved)
+        return ContinuedEvents(others, events.happened)
     return tuple(others)
 
 
 class ContinuedEvents(tuple):
-    """Events of a continued run, and the times at which each has happened before.
-
-    If the run has `moved`, its state or equations have changed where it continues.
-    """
+    """Events of a continued run, and the times at which each has happened before."""
 
     happened: tuple[np.ndarray, ...]
-    moved: bool
 
-    def __new__(cls, events: Any, happened: Any, *, moved: bool = False) -> ContinuedEvents:
+    def __new__(cls, events: Any, happened: Any) -> ContinuedEvents:
         """Make the tuple from the events and, for each event, the times at which it has happened."""
         found = super().__new__(cls, events)
-        found.happened, found.moved = tuple(happened), moved
+        found.happened = tuple(happened)
         return found
 
 
@@ -76,7 +72,6 @@ class Events:
         self.directions = np.array([_direction(getattr(item, "direction", 0)) for item in items])
         self._allowed = [_allowed(getattr(item, "terminal", None)) for item in items]
         self._happened = items.happened if isinstance(items, ContinuedEvents) else (None,) * len(items)
-        self._moved = isinstance(items, ContinuedEvents) and items.moved
         self.t: list[list[float]] = [[] for _ in items]
         self.y: list[list[np.ndarray]] = [[] for _ in items]
         self.last: tuple[float, np.ndarray] = math.nan, np.zeros(0)
@@ -129,7 +124,7 @@ class Events:
         """
         values = [self._value(k, t, y.copy()) for k in range(len(self.functions))]
         for k, (value, known) in enumerate(zip(values, self._happened, strict=True)):
-            if self._is_zero(k, value, t, y, f, step) if known is None or self._moved else t in known[-1:]:
+            if self._is_zero(k, value, t, y, f, step) if known is None else t in known[-1:]:
                 values[k] = 0.0
         return np.array(values, float)
 

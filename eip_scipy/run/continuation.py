@@ -70,7 +70,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     asked = {name: value for name, value in origin.arguments.items() if name not in FIRST_PART}
     asked |= {"t_span": (origin.t, t), "y0": origin.y, "invariants": origin.kept()}
     if result.t_events is not None:
-        asked["events"] = ContinuedEvents(_events(asked), result.t_events, moved=bool(changes))
+        asked["events"] = ContinuedEvents(_events(asked), result.t_events)
     if changes:
         asked = _Restart(result, origin, asked, changes, options).arguments()
     elif options.get("jacobian") is not None:

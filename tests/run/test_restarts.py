@@ -114,11 +114,14 @@ def test_derivatives_by_the_restitution():
 def test_results_of_one_run_continued_twice_are_independent():
     first = bouncing(0.9, 1.0, 9.0, most=3, dense_output=True)
     ahead = first.continue_to(9.0, y=lambda y: [0.0, -y[1]])
+    rows = ahead.y.copy()
     other = first.continue_to(9.0, y=lambda y: [0.0, -0.5 * y[1]])
     for run in (ahead, other):
         np.testing.assert_array_equal(run.y[:, : first.t.size], first.y)
+        assert (run.t.size, run.t_events[0].size) == (first.t.size + 2, 4)
         np.testing.assert_allclose(run.sol(run.t[-1] - 0.01)[1], run.y[1, -1] + 0.01 * G)
     assert ahead.t_events[0][-1] - first.t[-1] == pytest.approx(2 * (other.t_events[0][-1] - first.t[-1]))
+    np.testing.assert_array_equal(ahead.y, rows)
     assert len(first.restarts) == 2
     assert np.shares_memory(first.y, ahead.y)  # so that a loop of restarts does not copy all rows each time
 
@@ -318,9 +321,9 @@ def test_a_wall_moves_the_state_away_from_its_event():
     def wall(t, y):
         return y[0] - 1
 
-    wall.terminal = True
+    wall.terminal, wall.direction = True, 1
     free = Problem("free", lambda t, y: [y[1], 0.0], y0=[0.25, 0.5], t_span=(0, 9), events=wall)
-    run = integrate(free, method=EIPRK4, h=0.1)
+    run = integrate(free, method=EIPRK4, h=3.0)  # the event lies inside the first step
     for _ in range(3):
         run = run.continue_to(9, y=lambda y: y - [1, 0])
     np.testing.assert_allclose(run.t_events[0], [1.5, 3.5, 5.5, 7.5], rtol=1e-13)
