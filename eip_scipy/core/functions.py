@@ -333,14 +333,10 @@ class _Compiler:
     pairs: dict[str, list[tuple[Any, int]]]
 
     def __init__(self, kind: Kind) -> None:
-        self._kind, self._is_off = kind, jit_is_off()
-        self.found, self.pairs = defaultdict(list), defaultdict(list)
+        self._kind, self.found, self.pairs = kind, defaultdict(list), defaultdict(list)
 
     def add(self, group: str, fun: Any, name: str, known: ByAddress | None = None, **form: Any) -> None:
-        """Add `fun` to the `group`, whose `form` is in fields of `Kind`; `name` is its name in messages.
-
-        `known` is its C function, if it has been compiled.
-        """
+        """Add `fun`, with its `name` in messages and its form in fields of `Kind`; `known` is its C function."""
         shape, real = form["shape"], form.get("real") or self._kind.dtype == "d"
         count = math.prod(shape) * (1 if real else 2)
         if known is not None:
@@ -349,7 +345,7 @@ class _Compiler:
             found = CompiledFunction(fun, count, fun)
         elif isinstance(fun, PointerFunction):
             found = CompiledFunction(fun, count, fun.address)
-        elif self._is_off:
+        elif jit_is_off():
             raise NotCompilableError("Numba's JIT is disabled (NUMBA_DISABLE_JIT)")
         elif not is_jitted(fun):
             why = getattr(fun, "not_jitted", "")  # of a function of this package that calls one of the user
@@ -404,12 +400,11 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     for k in range(len(invariants.items)):
         _add_invariant(add, run, k)
     for k, item in invariants.balances.items.items():
-        name = f"rate of balance {invariants.labels[k]!r}"
-        own: dict[str, Any] = {"real": True, "takes_f": item.rate_uses_f}
-        add("rate", item.rate_function, name, shape=invariants.shapes[k], gradient=True, **own)
+        name, takes_f = f"rate of balance {invariants.labels[k]!r}", item.rate_uses_f
+        add("rate", item.rate_function, name, shape=invariants.shapes[k], real=True, takes_f=takes_f, gradient=True)
     if run.uses_jacobian:
-        own = {"takes_f": True, "in_place": True, "gradient": True}
-        add("jacobian", problem.jacobian, "jacobian", shape=(n // 2,), size=n // 2, **own)
+        fun, half = problem.jacobian, n // 2
+        add("jacobian", fun, "jacobian", shape=(half,), size=half, takes_f=True, in_place=True, gradient=True)
     reason = ""
     try:
         for k, event in enumerate(problem.events.functions):
@@ -478,7 +473,7 @@ def by_address(call: Call, name: str, kind: Kind | None, params: np.ndarray, n: 
         function = _compiled(call.fun, kind, name)
     except NotCompilableError:
         return call
-    return call._replace(compiled=ByAddress(function.address, gradient, params, function))
+    return Call(*call[:-1], compiled=ByAddress(function.address, gradient, params, function))
 
 
 def reraise_user_exception(

@@ -156,8 +156,8 @@ class Driver:
 
     def save(self, t: float, y: np.ndarray) -> None:
         """Append a time and a state to the saved rows."""
-        self.t[self.rows], self.y[self.rows] = t, y
-        self.schedule.place[ROW] += 1
+        row = self.rows
+        self.t[row], self.y[row], self.schedule.place[ROW] = t, y, row + 1
 
     def save_now(self) -> None:
         """Save the last accepted state, or its projected copy, unless it is the last saved row already."""
@@ -216,7 +216,8 @@ class Driver:
 
     def values(self) -> np.ndarray:
         """Return the invariants of the saved states, (m, l)."""
-        return self.values_at(self.t[: self.rows], self.y[: self.rows])
+        rows = self.rows
+        return self.values_at(self.t[:rows], self.y[:rows])
 
     def values_at(self, t: np.ndarray, y: np.ndarray, *params: np.ndarray) -> np.ndarray:
         """Return the invariants (m, l) of states (m, n), each with its own `params` (m, p) if these are given."""

@@ -332,7 +332,7 @@ class Loop:
                 return -1, failure(code, driver.run, schedule.clock)
             if is_check_due(step) or driver.run.work.suspect[REASON] != NOTHING:
                 self._check()
-                if slowed := driver.run.slowed(step, *driver.now):
+                if self._doubtful and (slowed := driver.run.slowed(step, *driver.now)):
                     self._ended_early = True
                     return -1, slowed
             if code == FULL:
@@ -422,7 +422,7 @@ class Loop:
             if not broken:
                 raise
             values = np.full((driver.rows, run.invariants.size), np.nan)
-        target = run.invariants.fixed_target
+        rows, target = len(values), run.invariants.fixed_target
         driver.note(values, target)
         at_events, self.remarks = event_derivatives(run.problem, driver.schedule.span.t0, events.t, events.y)
         notes = self.notes()
@@ -434,10 +434,10 @@ class Loop:
             asked = asked._replace(variations=run.tangents.restarted(y))
         result = assembled(
             run,
-            driver.y[: driver.rows],
+            driver.y[:rows],
             (events.t, events.y) if events.functions else None,
             run.work.counters,
-            t=driver.t[: driver.rows],
+            t=driver.t[:rows],
             invariants=values.T,
             target=target,
             max_residual=run.work.max_residual,
