@@ -30,7 +30,7 @@ def assert_output(found, printed):
 
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
-    "tutorials/pdes", "tutorials/ensembles", "how-to/find-invariants",
+    "tutorials/ensembles", "how-to/find-invariants",
     "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity", "tutorials/satellites",
@@ -46,7 +46,7 @@ OF_SECTIONS = {"docs/how-to/other-packages.md": ("gala", "galpy", "qutip")}
 NIGHTLY = (
     "results/long-orbits", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
     "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend", "how-to/multistep",
-    "how-to/variable-steps", "tutorials/own-pde",
+    "how-to/variable-steps", "tutorials/pdes",
 )  # fmt: skip
 
 
