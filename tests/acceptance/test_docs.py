@@ -29,11 +29,11 @@ def assert_output(found, printed):
 
 
 PAGES = (
-    "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/rebound-and-astropy",
+    "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
     "tutorials/ensembles", "how-to/find-invariants",
     "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
-    "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity", "tutorials/satellites",
+    "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity",
     "how-to/diagnostics", "how-to/other-packages",
 )  # fmt: skip
 NEEDED = {
