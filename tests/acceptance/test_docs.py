@@ -30,8 +30,7 @@ def assert_output(found, printed):
 
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
-    "tutorials/ensembles", "how-to/find-invariants",
-    "how-to/tables-figures-files", "how-to/checkpoints",
+    "tutorials/pdes", "tutorials/ensembles", "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
     "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity",
     "how-to/diagnostics", "how-to/other-packages",
@@ -46,7 +45,7 @@ OF_SECTIONS = {"docs/how-to/other-packages.md": ("gala", "galpy", "qutip")}
 NIGHTLY = (
     "results/long-orbits", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
     "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend", "how-to/multistep",
-    "how-to/variable-steps", "tutorials/pdes",
+    "how-to/variable-steps",
 )  # fmt: skip
 
 
