@@ -31,16 +31,14 @@ def assert_output(found, printed):
 PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
     "tutorials/pdes", "tutorials/ensembles", "how-to/tables-figures-files", "how-to/checkpoints",
-    "how-to/own-methods", "how-to/consistent-starts", "how-to/gradients", "how-to/mechanisms",
-    "how-to/pydy", "how-to/constraints", "how-to/fitting", "how-to/positivity",
+    "how-to/own-methods", "how-to/gradients", "how-to/mechanisms", "how-to/fitting", "how-to/positivity",
     "how-to/diagnostics", "how-to/other-packages",
 )  # fmt: skip
 NEEDED = {
     "docs/how-to/gradients.md": ("jax", "torch"),
-    "docs/how-to/pydy.md": ("pydy",),
 }
 # Packages of single sections, which are left out if theirs is missing.
-OF_SECTIONS = {"docs/how-to/other-packages.md": ("gala", "galpy", "qutip")}
+OF_SECTIONS = {"docs/how-to/mechanisms.md": ("pydy",), "docs/how-to/other-packages.md": ("gala", "galpy", "qutip")}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
     "results/long-orbits", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
@@ -65,7 +63,7 @@ def test_page(page, capsys, tmp_path, monkeypatch):
     path = ROOT / page
     text = path.read_text(encoding="utf-8")
     for package in (name for name in OF_SECTIONS.get(page, ()) if find_spec(name) is None):
-        text = re.sub(rf"^## {package}:.*?(?=^## )", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S)
+        text = re.sub(rf"^## {package}:.*?(?=^## )", lambda m: "\n" * m[0].count("\n"), text, flags=re.I | re.M | re.S)
     namespace = {"__name__": path.stem}
     for block in BLOCK.finditer(text):
         language, code = block.groups()
