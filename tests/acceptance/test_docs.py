@@ -32,13 +32,13 @@ PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
     "tutorials/pdes", "tutorials/ensembles", "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/gradients", "how-to/mechanisms", "how-to/fitting", "how-to/positivity",
-    "how-to/diagnostics", "how-to/other-packages",
+    "how-to/diagnostics",
 )  # fmt: skip
 NEEDED = {
     "docs/how-to/gradients.md": ("jax", "torch"),
 }
 # Packages of single sections, which are left out if theirs is missing.
-OF_SECTIONS = {"docs/how-to/mechanisms.md": ("pydy",), "docs/how-to/other-packages.md": ("gala", "galpy", "qutip")}
+OF_SECTIONS = {"docs/how-to/mechanisms.md": ("pydy",), "docs/how-to/own-methods.md": ("gala", "galpy", "qutip")}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
     "results/long-orbits", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
