@@ -41,7 +41,7 @@ NEEDED = {
 OF_SECTIONS = {"docs/how-to/mechanisms.md": ("pydy",), "docs/how-to/own-methods.md": ("gala", "galpy", "qutip")}
 # These take six seconds or more each; quicker tests of the same methods run in the gate.
 NIGHTLY = (
-    "results/long-orbits", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
+    "results/solar-system", "results/charged-particles", "results/gross-pitaevskii", "how-to/write-only-h",
     "how-to/balances", "how-to/tangent-maps", "how-to/stiff-systems", "how-to/recommend", "how-to/multistep",
     "how-to/variable-steps",
 )  # fmt: skip
