@@ -32,7 +32,7 @@ PAGES = (
     "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
     "tutorials/pdes", "tutorials/ensembles", "how-to/tables-figures-files", "how-to/checkpoints",
     "how-to/own-methods", "how-to/gradients", "how-to/mechanisms", "how-to/fitting", "how-to/positivity",
-    "how-to/diagnostics",
+    "explanation/trust",
 )  # fmt: skip
 NEEDED = {
     "docs/how-to/gradients.md": ("jax", "torch"),
