@@ -62,7 +62,8 @@ def test_page(page, capsys, tmp_path, monkeypatch):
     path = ROOT / page
     text = path.read_text(encoding="utf-8")
     for package in (name for name in OF_SECTIONS.get(page, ()) if find_spec(name) is None):
-        text = re.sub(rf"^##+ \w*{package}\b.*?(?=^##|\Z)", lambda m: "\n" * m[0].count("\n"), text, flags=re.I | re.M | re.S)
+        section = re.compile(rf"^##+ \w*{package}\b.*?(?=^##|\Z)", re.IGNORECASE | re.MULTILINE | re.DOTALL)
+        text = section.sub(lambda m: "\n" * m[0].count("\n"), text)
     namespace = {"__name__": path.stem}
     for block in BLOCK.finditer(text):
         language, code = block.groups()
