@@ -89,8 +89,9 @@ def without_single_names(app, env):
 
 
 def show_notebooks():
-    """Copy the executed notebooks of examples/ next to their page, and remove older copies."""
+    """Copy the executed notebooks of examples/ to where Sphinx finds them, and remove older copies."""
     shown = Path(__file__).parent / "notebooks"
+    shown.mkdir(exist_ok=True)
     for page in shown.glob("*.ipynb"):
         page.unlink()
     for source in (shown.parents[1] / "examples").glob("*.ipynb"):

@@ -81,7 +81,7 @@ class Invariant:
     C functions are given as `scipy.LowLevelCallable`, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
     ``int G(double t, const double *y, const double *f, double *out, const double *params)``; f is the derivative of
-    the state only with ``uses_f=True``; otherwise its content is undefined. See :doc:`/tutorials/c-functions`.
+    the state only with ``uses_f=True``; otherwise its content is undefined. See :doc:`/tutorials/compiled-functions`.
 
     Examples
     --------

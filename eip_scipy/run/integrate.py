@@ -91,7 +91,7 @@ def integrate(
         ``fun(t, y[, params]) -> (n,)``; with ``in_place=True``, ``fun(t, y, out[, params])``. For a compiled run a
         lazily jitted Numba function, or a C function as `scipy.LowLevelCallable`,
         ``int fun(double t, const double *y, double *out, const double *params)``, see
-        :doc:`/tutorials/c-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
+        :doc:`/tutorials/compiled-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
         (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), ``fun`` must return (v, a); give `acceleration` instead to
         write only a. A `Problem` contains everything else; options given here take precedence.
     t_span : (float, float)

@@ -12,9 +12,9 @@ import pytest
 from c_compiler import compiler
 from test_docs import ROOT, assert_output
 
-PAGE = (ROOT / "docs/tutorials/c-functions.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/tutorials/compiled-functions.md").read_text(encoding="utf-8").partition("## Functions in C")[2]
 BUILD = re.compile(r"^```console\n\$ (.*)\n```$", re.MULTILINE)
-PRINTED = re.compile(r"^```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PRINTED = re.compile(r"^```console\n\$ python \S+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from eip_scipy import ensemble, load
 from eip_scipy.problems import kepler
 
 pytest.importorskip("mpi4py", reason="needs mpi4py: pip install mpi4py mpich")
-PAGE = Path(__file__).parents[2] / "docs/how-to/other-packages.md"
+PAGE = Path(__file__).parents[2] / "docs/how-to/own-methods.md"
 LAUNCHER = shutil.which("mpiexec") or shutil.which("mpiexec", path=str(Path(sys.executable).parent))
 
 
