@@ -240,7 +240,7 @@ class BatchRunner:
         first_steps, events = self._at_start(y0s, params)
         return data.Members(
             starts=y0s, params=params, first_steps=first_steps, events=events, evaluations=self._evaluations,
-            sigma=self._sigma, left=self._left, kept=kept, where=np.zeros(2, np.int64),
+            sigma=self._sigma, left=self._left, t_saved=self._driver.t, kept=kept, where=np.zeros(2, np.int64),
             rows=np.empty((m if kept else 1, *self._driver.y.shape), y0s.dtype),
             counters=np.zeros((m, data.N_COUNTERS), np.int64),
             figures=np.zeros((m, *self._driver.run.work.trust.shape)),
@@ -271,9 +271,6 @@ class BatchRunner:
     def _advance(self, each: data.Members, out: dict[str, Any]) -> bool:
         """Make some steps; return False if the current member must run alone, and go to the next one then."""
         driver, first = self._driver, int(each.where[0])
-        if not self.not_batched_because:
-            driver.sweep_octets(each, self._steps)
-            return True
         try:
             code = driver.sweep(each, self._steps)
         except Exception:  # of a user's function; it is raised again when the member runs alone

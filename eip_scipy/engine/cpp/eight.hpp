@@ -1,8 +1,7 @@
 // Eight members of an ensemble: their functions, buffers and counters.
 #pragma once
 
-#include <functional>
-#include <numeric>
+#include <bit>
 
 #include "system.hpp"
 
@@ -98,38 +97,38 @@ struct Eight {
     using Run = RunOf<Work, OctetSystem>;
 
     Method method;
-    Options options;  // those of the run, tolerances for 8 n floats
+    Options options, flat_options{};  // those of the run; with tolerances for 8 n floats
     OctetSystem system;
     std::vector<Octet> memory;
-    std::vector<double> tolerances, no_norm, suspects;  // the last of all members, one after the other
-    Multistep multistep{};                              // of a multistep method: that of one state of 8 n floats
+    std::vector<double> tolerances, no_norm;
+    Multistep multistep{};  // of a multistep method: that of one state of 8 n floats
     int64_t counters[N_COUNTERS] = {};
-    Work flat{};
     WorkOf<Octet> work{};
+    Work flat{};                              // the same buffers seen as those of one state of 8 n floats
     SizedWith<4, 2, Octet> short_work{work};  // the same where it is of that length
-    Octet *y, *y_new, *projections, *skips, *reduced, *levels, *nodes, *sums, *predicted, *change;
-    // Members that are still here; their counters beyond those of all; rank of the last projection.
-    bool alive[LANES] = {};
-    int64_t first = -1, count = 0;  // the first of them, of how many in all
-    int64_t step = 0, row = 0;      // the next step, and the next row to be saved
-    int64_t own[LANES][N_COUNTERS] = {}, rank[LANES] = {};
+    Octet *y, *y_new, *suspects, *levels, *nodes, *sums, *predicted, *change;
+    Mask alive{}, corrected{};            // members that are still here; those that the last projection moved
+    int64_t first = -1, count = 0;        // the first member, of how many in all
+    int64_t own[LANES][N_COUNTERS] = {};  // the counters of each beyond those of all
     int64_t place[N_NODE_PLACES] = {}, projected[LANES] = {};  // of the history; the node of each one's last projection
 
     Eight(const Method &method, const Options &o, const Work &w, OctetSystem functions)
         : method(method),
           options(o),
+          flat_options(o),
           system(std::move(functions)),
           no_norm(1) {
-        const int64_t n = w.n, l = w.l, blocks = o.blocks.count, products = o.frame.rows;
+        const int64_t n = w.n, l = w.l, products = o.frame.rows;
         work.n = work.m = n;
         work.l = l;
         work.stages = w.stages;
         const Multistep *ms = method.multistep;
         const int64_t half = ms ? ms->half : 0, nodes_kept = ms ? ms->rows : 0;
         Places places;
-        each_buffer(work, blocks, places);
-        places.add(work.target, l, work.products, products, y, n, y_new, n, projections, 1, skips, 1, reduced, 1,
-                   levels, 3 * l, nodes, nodes_kept * half, sums, 4 * half, predicted, 3 * half, change, half);
+        places.sizes.blocks = o.blocks.count;
+        work.fields(places);
+        places.add(work.target, l, work.products, products, y, n, y_new, n, suspects, work.suspect_size(), levels,
+                   3 * l, nodes, nodes_kept * half, sums, 4 * half, predicted, 3 * half, change, half);
         memory.resize(places.total, Octet(0.0));
         Octet *next = memory.data();
         for (const auto &[place, count] : places.of) {
@@ -137,35 +136,64 @@ struct Eight {
             next += count;
         }
         work.counters = counters;
+        work.norm = no_norm.data();
         short_work = SizedWith<4, 2, Octet>(work);
-        suspects.resize(LANES * work.suspect_size());
+        flat = std::bit_cast<Work>(work);
+        flat.n = flat.m = LANES * n;
         tolerances.resize(2 * LANES * n);
         for (int64_t i = 0; i < LANES * n; ++i) {
             tolerances[i] = o.rtol[i / LANES];
             tolerances[LANES * n + i] = o.atol[i / LANES];
         }
-        flatten(w);
+        flat_options.rtol = tolerances.data();
+        flat_options.atol = tolerances.data() + LANES * n;
         if (ms) lengthen(*ms, nodes_kept);
     }
 
-    Run run() { return {method, flat_options_, flat, system, nullptr}; }
-    double &at(Octet *a, int64_t lane) const { return OctetSystem::floats_of(a)[lane]; }
-
-    // The suspect step of one member.
-    double *suspect(int64_t lane) { return suspects.data() + lane * work.suspect_size(); }
-    const double *suspect(int64_t lane) const { return suspects.data() + lane * work.suspect_size(); }
+    Run run() { return {method, flat_options, flat, system, nullptr}; }
 
     // Conversion of one member's part of n vectors to floats and back.
-    void take(const Octet *a, int64_t lane, double *out, int64_t n) const {
+    static void take(const Octet *a, int64_t lane, double *out, int64_t n) {
         for (int64_t i = 0; i < n; ++i) out[i] = OctetSystem::floats_of(a)[LANES * i + lane];
     }
-    void give(const double *a, int64_t lane, Octet *out, int64_t n) const {
+    static void give(const double *a, int64_t lane, Octet *out, int64_t n) {
         for (int64_t i = 0; i < n; ++i) OctetSystem::floats_of(out)[LANES * i + lane] = a[i];
+    }
+
+    // Call `move` with each buffer that a projection changes for the next one, of all members and of one, and its length.
+    template <class Move>
+    void each_carried(const Work &one, const Move &move) const {
+        move(work.sigma, one.sigma, one.m);
+        move(work.memory, one.memory, MEMORIES * options.blocks.count);
+        move(work.trust, one.trust, one.l * N_FIGURES);
+        move(work.max_residual, one.max_residual, one.l);
+        move(work.max_correction, one.max_correction, 1);
+        move(suspects, one.suspect, one.suspect_size());
+    }
+
+    // The counters of one member if all members have counted `shared`.
+    void count_of(int64_t lane, const int64_t *shared, int64_t *out) const {
+        for (int c = 0; c < N_COUNTERS; ++c) out[c] = shared[c] + own[lane][c];
+    }
+
+    // Calls `action` for each of those members. One for which it fails is removed: it must be run alone.
+    template <class Action>
+    void each_alone(const Mask &those, const Action &action) {
+        for (int64_t lane = 0; any(those) && lane < LANES; ++lane) {
+            if (!those.lane(lane)) continue;
+            bool good = false;
+            try {
+                good = action(lane);
+            } catch (const Broken &) {
+            }
+            if (!good) alive.set(lane, false);
+        }
     }
 
   private:
     // Starts and lengths of the buffers of vectors; other buffers of a run do not belong to its members.
     struct Places {
+        Sizes sizes;
         std::vector<std::pair<Octet **, int64_t>> of;
         int64_t total = 0;
 
@@ -175,46 +203,19 @@ struct Eight {
             total += count;
             if constexpr (sizeof...(others) > 0) add(others...);
         }
-        void operator()(const char *, Octet *&place, std::initializer_list<int64_t> shape) {
-            add(place, std::accumulate(shape.begin(), shape.end(), int64_t{1}, std::multiplies()));
-        }
-        void states(const char *name, Octet *&place, std::initializer_list<int64_t> shape) {
-            (*this)(name, place, shape);
-        }
+        void operator()(const char *, Octet *&place, auto... lengths) { add(place, (int64_t{1} * ... * lengths)); }
+        void states(const char *, Octet *&place, auto... lengths) { add(place, (int64_t{1} * ... * lengths)); }
         template <class Other>
-        void operator()(const char *, Other *&, std::initializer_list<int64_t>) {}
+        void operator()(const char *, Other *&, auto...) {}
     };
-
-    Options flat_options_{};
-
-    template <class... Others>
-    static void see(double *&place, Octet *octets, Others &&...others) {
-        place = OctetSystem::floats_of(octets);
-        if constexpr (sizeof...(others) > 0) see(others...);
-    }
-
-    // Sets up `flat`: the same buffers seen as those of one state of 8 n floats, as far as the raw step needs them.
-    void flatten(const Work &w) {
-        flat.n = flat.m = LANES * w.n;
-        flat.l = w.l;
-        flat.stages = w.stages;
-        see(flat.K, work.K, flat.stage, work.stage, flat.y_hat, work.y_hat, flat.err, work.err, flat.err_low,
-            work.err_low, flat.err_sum, work.err_sum, flat.carry, work.carry, flat.carry_hat, work.carry_hat,
-            flat.f_point, work.f_point, flat.move, work.move);
-        flat.norm = no_norm.data();
-        flat.counters = counters;
-        flat_options_ = options;
-        flat_options_.rtol = tolerances.data();
-        flat_options_.atol = tolerances.data() + LANES * w.n;
-    }
 
     // The history of one state of 8 n floats.
     void lengthen(const Multistep &one, int64_t rows) {
         multistep = one;
         multistep.half = multistep.pitch = LANES * one.half;
         multistep.rows = rows;
-        multistep.first *= LANES;
-        multistep.count *= LANES;
+        multistep.corrected_first *= LANES;
+        multistep.corrected_count *= LANES;
         multistep.nodes = OctetSystem::floats_of(nodes);
         multistep.sums = OctetSystem::floats_of(sums);
         multistep.predicted = OctetSystem::floats_of(predicted);

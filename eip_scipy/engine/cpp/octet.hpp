@@ -68,6 +68,7 @@ struct Mask {
     bool lane(int64_t k) const { return (bits() >> k & 1U) != 0; }
     bool any() const { return bits() != 0; }
     bool all() const { return bits() == (1U << LANES) - 1U; }
+    void set(int64_t k, bool value) { part[k / WIDTH][k % WIDTH] = value ? -1 : 0; }
 };
 
 struct Octet {

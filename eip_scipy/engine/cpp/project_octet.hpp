@@ -21,7 +21,7 @@ namespace eip {
         eight.take(f, lane, w.f_point, w.m);
     }
     const int64_t rank = factored_move(o, w, f ? w.f_point : nullptr, w.stage);
-    eight.rank[lane] = std::max<int64_t>(rank, 0);
+    eight.own[lane][LAST_RANK] = std::max<int64_t>(rank, 0);
     for (double *out : {w.move, w.stage})
         if (rank < 0) fill(out, NOT_A_NUMBER, w.m);
     eight.give(w.move, lane, eights.move, w.m);
@@ -101,7 +101,7 @@ template <class W>
     const Octet *f = flow_at_raw(run, step);
     if (f) remove_shift(o, w, f, -1, eight.y_new);
     for (int64_t lane = 0; lane < LANES; ++lane)
-        if (all_move || moved.lane(lane)) eight.rank[lane] = w.l;
+        if (all_move || moved.lane(lane)) eight.own[lane][LAST_RANK] = w.l;
     if (any(dependent))
         for (int64_t lane = 0; lane < LANES; ++lane)
             if (dependent.lane(lane)) solve_alone(eight, lane, f, o, single);
@@ -121,12 +121,17 @@ template <class W>
         w.max_residual[i] = where(done, max(w.max_residual[i], abs(w.residual[i])), w.max_residual[i]);
     for (int64_t b = 0; o.metric == BY_ERROR && b < MEMORIES * blocks; ++b)
         w.memory[b] = where(done, w.memory_new[b], w.memory[b]);
-    const Mask corrected = done & outside;
-    *w.max_correction = where(corrected, max(*w.max_correction, correction), *w.max_correction);
-    *eight.projections += where(corrected, 1.0, 0.0);
-    *eight.skips += where(done & !outside, 1.0, 0.0);
-    for (int64_t lane = 0; any(dependent) && lane < LANES; ++lane)
-        if (corrected.lane(lane) && eight.rank[lane] < w.l) eight.at(eight.reduced, lane) += 1.0;
+    eight.corrected = done & outside;
+    *w.max_correction = where(eight.corrected, max(*w.max_correction, correction), *w.max_correction);
+    const unsigned finished = done.bits(), changed = eight.corrected.bits();
+    for (int64_t lane = 0; lane < LANES; ++lane) {
+        int64_t *own = eight.own[lane];
+        const unsigned moves = changed >> lane & 1U;
+        own[PROJECTIONS] += moves;
+        own[NLU] += moves;
+        own[SKIPPED] += (finished >> lane & 1U) - moves;
+        own[RANK_REDUCED] += moves && own[LAST_RANK] < w.l;
+    }
     return alive & !done;
 }
 
@@ -145,16 +150,15 @@ inline Mask project_octet(Eight &eight, const W &w, const Step &step, const Mask
 }
 
 // Projects eight members of a multistep method as `project_nodes` projects one. Members whose steps are not stable are
-// removed from `alive`. Returns the members that must be projected alone; the errors gathered for them before are in
-// w.err_low.
-inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
+// removed. Returns the members that must be projected alone; the errors gathered for them before are in w.err_low.
+inline Mask project_octet_nodes(Eight &eight, const Work &single) {
     const Options &o = eight.options;
     const WorkOf<Octet> &w = eight.work;
     const Multistep &ms = eight.multistep;
     const RunOf<WorkOf<Octet>, OctetSystem> run{eight.method, o, w, eight.system, nullptr};
     Octet size;
     copy(w.err_sum, w.err_low, w.m);
-    alive = alive & estimate_nodes(ms, o, size, w);
+    const Mask alive = eight.alive = eight.alive & estimate_nodes(ms, o, size, w);
     if (w.l == 0 || ms.place[SEEN] <= COLLECTED) return Mask{};
     const double t = ms.t0 + static_cast<double>(ms.place[NEWEST]) * ms.h;
     double since[LANES];
@@ -169,12 +173,11 @@ inline Mask project_octet_nodes(Eight &eight, Mask &alive, const Work &single) {
     residuals_in_the_middle(run, t, eight.y_new);
     w.counters[NJEV] = counted;
     soften_residuals(ms, o, w);
-    const Octet before = *eight.projections;
     const Mask leave = project_octet_evaluated(eight, w, Step{t, t, ms.h, nullptr, nullptr, true, true}, w.y_hat, those,
                                                single),
                done = those & !leave;
     note_what_is_left(ms, done, w);
-    move_sums(ms, *eight.projections > before, w);
+    move_sums(ms, eight.corrected, w);
     for (int lane = 0; lane < LANES; ++lane) {
         if (!done.lane(lane)) continue;
         eight.projected[lane] = ms.place[SINCE];

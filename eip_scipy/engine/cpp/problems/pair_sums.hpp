@@ -22,6 +22,7 @@
 #include <vector>
 
 #include "../threads.hpp"
+#include "../two_floats.hpp"
 #include "inverse_roots.hpp"
 
 namespace eip {
@@ -341,22 +342,12 @@ struct Carried {
     }
 };
 
-// a + b, and its rounding error (Knuth) in `lost`.
-template <class T>
-inline T carried_sum(const T &a, const T &b, T &lost) {
-    const T total = a + b, part = total - a;
-    lost = (a - (total - part)) + (b - part);
-    return total;
-}
-
 // gm (square / 2 - potential) with its carry.
 inline Carried energy_of(const Octet &gm, const Carried &square, const Carried &potential) {
-    Octet lost;
-    const Octet energy = carried_sum<Octet>(0.5 * square.total, -potential.total, lost);
-    lost += 0.5 * square.carry - potential.carry;
+    const PairOf<Octet> energy = two_sum<Octet>(0.5 * square.total, -potential.total);
     Carried out;
-    out.add_product(gm, energy);
-    out.carry = multiply_add(gm, lost, out.carry);
+    out.add_product(gm, energy.value);
+    out.carry = multiply_add(gm, energy.rest + (0.5 * square.carry - potential.carry), out.carry);
     return out;
 }
 
@@ -367,9 +358,9 @@ inline double carried_fold(const Carried &sum) {
     sum.carry.store(carry);
     for (int width = LANES / 2; width > 0; width /= 2)
         for (int k = 0; k < width; ++k) {
-            double lost;
-            total[k] = carried_sum(total[k], total[k + width], lost);
-            carry[k] = (carry[k] + carry[k + width]) + lost;
+            const Pair sum = two_sum(total[k], total[k + width]);
+            total[k] = sum.value;
+            carry[k] = (carry[k] + carry[k + width]) + sum.rest;
         }
     return total[0] + carry[0];
 }
@@ -729,11 +720,8 @@ inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_
     if (stride == LANES) return k >= skip ? energy_of_body(y, gm, n, first + k) : Carried{};
     const Carried a = energy_of_some(y, gm, n, first, skip, k, 2 * stride);
     const Carried b = energy_of_some(y, gm, n, first, skip, k + stride, 2 * stride);
-    Carried out;
-    Octet lost;
-    out.total = carried_sum(a.total, b.total, lost);
-    out.carry = (a.carry + b.carry) + lost;
-    return out;
+    const PairOf<Octet> sum = two_sum(a.total, b.total);
+    return {sum.value, (a.carry + b.carry) + sum.rest};
 }
 
 inline Octet energy_sum(const Octet *y, const Octet *gm, int64_t n) {
