@@ -227,7 +227,7 @@ class LibraryFunction:
         """
 
     @property
-    def octet_address(self) -> int:
+    def lanes8_address(self) -> int:
         """Address of the version for eight states at once; 0 if there is none."""
 
     def bound(self, params: object) -> LibraryFunction:

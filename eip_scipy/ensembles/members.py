@@ -21,7 +21,7 @@ from ..core.inputs import shown
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
-from ..engine.native import BUILD, LibraryFunction, OctetFunctions
+from ..engine.native import BUILD, LibraryFunction, BatchFunctions
 from ..engine.trust import Trust, exceed_bounds, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
@@ -454,7 +454,7 @@ def not_batched_because(driver: Driver, members: int) -> str:
     except NotCompilableError as error:
         return str(error)
     product = jacobian[0][0] if jacobian else None
-    driver.engine.side_by_side(OctetFunctions(rhs[0][0], inv, grad, driver.functions, product))
+    driver.engine.side_by_side(BatchFunctions(rhs[0][0], inv, grad, driver.functions, product))
     return ""
 
 
@@ -465,7 +465,7 @@ def _for_lanes(native: CompiledFunction, little: bool) -> tuple[Any, int]:
     """
     one: Any = native.function
     if isinstance(one, LibraryFunction):
-        if not one.octet_address:
+        if not one.lanes8_address:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
         return one, native.floats
     if isinstance(one, PointerFunction):

@@ -130,7 +130,7 @@ void add_library(nb::module_ &module) {
             "returns_numbers", [](const Function &f) { return f.value == Value::NUMBERS; },
             "True if the function returns as many numbers for states of any size, and does not take f.")
         .def_prop_ro(
-            "octet_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
+            "lanes8_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
             "Address of the version for eight states at once; 0 if there is none.")
         .def(
             "bound",

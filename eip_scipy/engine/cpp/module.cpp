@@ -124,7 +124,7 @@ class Engine {
     void clear() {
         busy_ = true;
         interpolating_ = true;
-        eight_.reset();
+        batch_.reset();
         functions_.reset();
         hooks_.reset();
         kept_.reset();
@@ -149,7 +149,7 @@ class Engine {
     void side_by_side(nb::object functions) {
         const Busy busy(busy_);
         kept_.append(functions);
-        eight_ = std::make_unique<Eight>(data_.method, data_.options, data_.work, octet_system_of(functions, data_));
+        batch_ = std::make_unique<Batch>(data_.method, data_.options, data_.work, batch_functions_of(functions, data_));
     }
 
     int sweep(nb::object members, int64_t steps, nb::handle y, nb::handle y_new) {
@@ -163,14 +163,14 @@ class Engine {
                 "dense output if there are events");
         check_room(all.saved(0, data_.work));
         if (samples_) samples_->interpolants.capacity = 0;
-        if (!eight_)
+        if (!batch_)
             return stepped([&](const Run &run) { return sweep_members(run, samples(), s, all, steps, from, to); });
         const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
         const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
         require(fixed && (!all.kept || all.n_rows >= saved),
                 "engine: batches of members need fixed steps without events, a row for each saved state, and dense "
                 "output and kept rows for t_eval");
-        return stepped([&](const Run &run) { return sweep_octets(run, *eight_, samples(), s, all, steps, from, to); });
+        return stepped([&](const Run &run) { return sweep_batches(run, *batch_, samples(), s, all, steps, from, to); });
     }
 
     void sample(nb::object dense) {
@@ -307,7 +307,7 @@ class Engine {
     Data data_{};
     std::optional<Schedule> schedule_;
     std::optional<Samples> samples_;
-    std::unique_ptr<Eight> eight_;
+    std::unique_ptr<Batch> batch_;
     std::unique_ptr<PythonFunctions> functions_;
     std::unique_ptr<PythonHooks> hooks_;
     int type_ = NPY_DOUBLE;

@@ -72,11 +72,11 @@ class Reader {
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
     void operator()(const char *name, T *&place, Axes... axes) {
-        place = memory<std::remove_const_t<T>>(kept(name), name, TYPE<T>, axes...);
+        place = memory<std::remove_const_t<T>>(next(name), name, TYPE<T>, axes...);
     }
     template <class... Axes>
     void states(const char *name, double *&place, Axes... axes) {
-        place = memory<double>(kept(name), name, type_, axes...);
+        place = memory<double>(next(name), name, type_, axes...);
     }
     template <class Record>
         requires(sizeof(Record::RECORD) > 0)
@@ -90,17 +90,14 @@ class Reader {
     const Sizes sizes;
 
   private:
-    // To look a field up by its name takes most of the time of reading it.
+    // To look a field up by its name takes most of the time of reading it. A tuple keeps its items; others are kept here.
     nb::object next(const char *name) {
         const Py_ssize_t place = place_++;
-        if (!PyTuple_Check(record_.ptr()) || place >= PyTuple_Size(record_.ptr())) return record_.attr(name);
-        return nb::borrow(PyTuple_GetItem(record_.ptr(), place));
-    }
-
-    nb::object kept(const char *name) {
-        nb::object object = next(name);
-        kept_.append(object);
-        return object;
+        if (PyTuple_Check(record_.ptr()) && place < PyTuple_Size(record_.ptr()))
+            return nb::borrow(PyTuple_GetItem(record_.ptr(), place));
+        nb::object found = record_.attr(name);
+        kept_.append(found);
+        return found;
     }
 
     nb::handle record_;
@@ -111,6 +108,7 @@ class Reader {
 
 template <class Record>
 void read(Record &place, nb::handle record, int type, const Sizes &sizes, nb::list &kept) {
+    kept.append(record);
     Reader reader(record, type, sizes, kept);
     place.fields(reader);
 }
@@ -335,7 +333,7 @@ static void take(const LibraryFunction &function, LibraryCall<double> &place) {
              function.together,
              function.with_energy};
 }
-static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
+static void take(const LibraryFunction &function, LibraryCall<Lanes8> &place) {
     if (function.own.empty()) place = {function.eight};
 }
 
@@ -469,14 +467,14 @@ void read_pointers(nb::handle functions, const Work &w, const Columns &columns, 
     if (!system.balances.empty()) system.pulls.resize(w.m / 2);
 }
 
-OctetSystem octet_system_of(nb::handle functions, const Data &run) {
-    OctetSystem system;
+BatchFunctions batch_functions_of(nb::handle functions, const Data &run) {
+    BatchFunctions system;
     const Work &w = run.work;
     const int64_t size = run.system.second_order ? w.n / 2 : w.n, p = run.system.n_params;
-    using Values = Native<ValuePointer, Octet>;
+    using Values = Native<ValuePointer, Lanes8>;
     system.rhs_pointer = pointer_of<Values>(functions.attr("rhs"), "rhs", size, size, p);
     system.inv_pointers = pointers_of<Values>(functions, "inv", w.l, w.n, p);
-    system.grad_pointers = pointers_of<Native<GradientPointer, Octet>>(functions, "grad", w.l * w.n, w.n, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer, Lanes8>>(functions, "grad", w.l * w.n, w.n, p);
     system.second_order = run.system.second_order;
     system.params.resize(p);
     system.scratch.resize(w.n);
@@ -484,7 +482,8 @@ OctetSystem octet_system_of(nb::handle functions, const Data &run) {
     const Options &o = run.options;
     const nb::object jacobian = functions.attr("jacobian");
     if (!jacobian.is_none())
-        system.jacobian_pointer = pointer_of<Native<GradientPointer, Octet>>(jacobian, "jacobian", w.n / 2, w.n / 2, p);
+        system.jacobian_pointer =
+            pointer_of<Native<GradientPointer, Lanes8>>(jacobian, "jacobian", w.n / 2, w.n / 2, p);
     const Multistep *ms = run.method.multistep;
     const bool steps = ms ? !ms->brief && !ms->level && (ms->corrected_count == 0 || !jacobian.is_none())
                           : !o.compensated && o.every >= 1;
@@ -540,6 +539,8 @@ struct Maker {
     }
 };
 
+nb::handle work_type;  // the record's class in Python, which the module keeps
+
 nb::object new_work(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances) {
     require(n >= 0 && stages >= 0 && invariants >= 0 && blocks >= 0 && balances >= 0,
             "engine: a negative number of buffers");
@@ -552,7 +553,8 @@ nb::object new_work(int64_t n, nb::handle dtype, int64_t stages, int64_t invaria
     work.fields(maker);
     fill(work.sigma, 1.0, work.m);
     for (int64_t i = 0; i < work.l; ++i) work.figures(i)[TERMS] = ENDLESS;
-    return nb::module_::import_("eip_scipy.engine.data").attr("Work")(*nb::tuple(maker.arrays));
+    // What `Work(*arrays)` does, without its function in Python.
+    return nb::handle(reinterpret_cast<PyObject *>(&PyTuple_Type)).attr("__new__")(work_type, maker.arrays);
 }
 
 }  // namespace
@@ -561,6 +563,7 @@ void add_records(nb::module_ &module) {
     const auto add = [&module]<class... Records>(std::tuple<Records...> *) { (add_record<Records>(module), ...); };
     add(static_cast<std::tuple<Span, Schedule, Multistep, Method, Blocks, Frame, Balances, Groups, Columns, Options,
                                Members, Samples, Work> *>(nullptr));
+    work_type = nb::object(module.attr("Work"));
     module.def("new_work", new_work, "n"_a, "dtype"_a, "stages"_a, "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0,
                nb::sig("def new_work(n: int, dtype: typing.Any, stages: int, n_invariants: int, n_blocks: int, "
                        "n_balances: int = 0) -> Work"),

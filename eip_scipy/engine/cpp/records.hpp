@@ -40,7 +40,7 @@ Schedule schedule_of(nb::handle schedule, nb::list &kept);
 Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, nb::list &kept);
 Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int type, nb::list &kept);
 // Functions of eight members of the run.
-OctetSystem octet_system_of(nb::handle functions, const Data &run);
+BatchFunctions batch_functions_of(nb::handle functions, const Data &run);
 // The balances among the invariants; their rates by pointer are read with the other functions.
 void read_balances(nb::handle functions, const Work &w, System &system);
 // Functions by pointer; `columns` must live as long as the system.

@@ -5,17 +5,17 @@
 #include <cmath>
 #include <type_traits>
 
-#include "../octet.hpp"
+#include "../lanes8.hpp"
 
 namespace eip {
 
 struct Dual {
     double value = 0.0;
-    Octet slope = 0.0;
+    Lanes8 slope = 0.0;
 
     Dual() = default;
     Dual(double x) : value(x) {}  // NOLINT: a constant
-    Dual(double x, const Octet &slope) : value(x), slope(slope) {}
+    Dual(double x, const Lanes8 &slope) : value(x), slope(slope) {}
 
     Dual operator-() const { return {-value, -slope}; }
     Dual &operator+=(const Dual &b) { return *this = {value + b.value, slope + b.slope}; }

@@ -106,7 +106,7 @@ void variational(const Given<double> &g) {
         const auto slopes = [&](const double *numbers) {
             double lanes[LANES];
             for (int64_t k = 0; k < LANES; ++k) lanes[k] = numbers[size * std::min(first + k, columns)];
-            return Octet::load(lanes);
+            return Lanes8::load(lanes);
         };
         for (int64_t i = 0; i < size; ++i) y[i] = {g.y[i], slopes(g.y + i)};
         for (int64_t i = 0; i < half; ++i) a[i] = {newton[i], slopes(g.out + half + i)};
