@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.util import find_spec
+from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 import numpy as np
@@ -36,6 +37,8 @@ BY_NAME = (
     "pass it by name: integrate(acceleration=fun, t_span=..., y0=..., ...), or "
     "eip_scipy.solve_ivp(acceleration=fun, t_span=..., y0=..., ...)"
 )
+# States of at most this many components are so short that a call, and what functions share, take most of a step's time.
+FEW = 12
 EXACT = 2**53  # integers up to this one are exact as floats
 # Signatures of C functions.
 VALUE = "int (double t, const double *y, double *out, const double *params)"
@@ -355,6 +358,22 @@ class _Compiler:
         self.found[group].append(CompiledFunction(function, count, entry))
         self.pairs[group].append((entry, count))
 
+    def together(self) -> int | None:
+        """Return the address of one C function of all functions of a run, or None if there is none.
+
+        There is one if the state is real and short, the functions are jitted, and the gradients do not take f.
+        """
+        groups = [[known.function for known in self.found[name]] for name in ("rhs", "inv", "grad")]
+        functions = [[cast("Compiled", part) for part in group if hasattr(part, "library")] for group in groups]
+        if self._width > 1 or functions != groups or any(part.kind.takes_f for part in chain(*functions)):
+            return None
+        from .in_one_pass import in_one_pass
+
+        (rhs,), inv, grad = functions
+        address, library = in_one_pass(rhs, tuple(inv), tuple(grad))
+        self.found["together"].append(library)
+        return address
+
 
 def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     """Return the addresses of the functions of a run, and the reason why those of its events are missing, or "".
@@ -387,6 +406,9 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
     except NotCompilableError as error:
         pairs["event"], compiler.found["event"], reason = [], [], str(error)
     rates = [entry for entry, _ in pairs["rate"]]
+    together = None
+    if n <= FEW and problem.variations is None and not invariants.balances.items and invariants.items:
+        together = compiler.together()
     return NativeFunctions(
         rhs=pairs["rhs"][0][0],
         inv=pairs["inv"],
@@ -397,6 +419,7 @@ def native_functions(run: Run) -> tuple[NativeFunctions, str]:
         jacobian=pairs["jacobian"][0][0] if run.uses_jacobian else None,
         rates=invariants.rates(run.options.adaptive, rates) if rates else Rates(),
         by_parameters=pairs["by_parameters"],
+        together=together,
         floors=invariants.floors if any([entry is None for entry, _ in pairs["grad"]]) else None,
         keepalive=compiler.found,
     ), reason

@@ -92,7 +92,8 @@ class NativeFunctions(NamedTuple):
     gradient is computed by differences, with a shift of each component that is proportional to the sum of the absolute
     value of the component and its entry of `floors` (n,). `python` contains the functions in Python if events are
     called from Python; then `event` is empty. `by_parameters` are the derivatives of each invariant with respect to the
-    parameters whose columns of derivatives follow the state.
+    parameters whose columns of derivatives follow the state. `together` is the address of one C function that computes
+    the derivative, all invariants and all gradients, see ``Wanted`` in cpp/library.hpp, or None.
     """
 
     rhs: Any
@@ -107,6 +108,7 @@ class NativeFunctions(NamedTuple):
     floors: np.ndarray | None = None
     rates: Rates = Rates()
     by_parameters: Sequence[tuple[Any, int]] = ()
+    together: int | None = None
     native: bool = True
 
 

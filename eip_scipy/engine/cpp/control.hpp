@@ -43,7 +43,7 @@ inline void evaluate_raw(const AnyRun &run, const Step &step) {
         auto &system = run.system;
         system.at_raw = Known::NOTHING;
         if (step.project && (system.together || system.with_energy))
-            return system.evaluate_for_projection(w, w.y_hat, w.last());
+            return system.evaluate_for_projection(w, step.t_new, w.y_hat, w.last());
         if (!is_for_projection(run.options, step)) return system.rhs_of_whole(w, step.t_new, w.y_hat, w.last());
     }
     run.system.rhs(w, step.t_new, w.y_hat, w.last());
@@ -119,6 +119,8 @@ inline void close_derivative(const AnyRun &run, double t, const double *y, bool 
     if constexpr (IS_SINGLE<AnyRun>)
         if (w.balances > 0) [[unlikely]]
             return close_balances(of_any_length(run), t, y, wanted);
+    if constexpr (IS_SINGLE<AnyRun>)
+        if (wanted && run.system.has_f_at_end) return copy(run.system.f_at_end.data(), w.last(), w.m);
     if (wanted) run.system.rhs(w, t, y, w.last());
 }
 
@@ -149,6 +151,7 @@ inline void close_step(const AnyRun &run, const Step &step, Code status) {
 template <class AnyRun>
 inline Code finish_step(const AnyRun &run, const Step &step) {
     Code status = OK;
+    if constexpr (IS_SINGLE<AnyRun>) run.system.has_f_at_end = false;
     if (step.project) {
         status = project_whole(run, step);
         if (status == NEAR_SINGULAR) [[unlikely]]

@@ -47,6 +47,21 @@ inline void evaluate_invariants(const AnyRun &run, double t, const Value *y) {
     evaluate_carried<AnyRun, Value>(run, t, y, run.work.carry_hat, run.work.G);
 }
 
+// Computes w.values at the end of a step, and the derivative with them where one pass gives both and the next step begins with
+// it. That derivative is of no use after another try.
+template <class AnyRun>
+inline void evaluate_end(const AnyRun &run, const Step &step) {
+    const auto &w = run.work;
+    if constexpr (IS_SINGLE<AnyRun>) {
+        auto &system = run.system;
+        const bool wanted = system.together && !run.method.multistep && !(w.counters[HAVE_F] && run.options.reuse_f);
+        system.has_f_at_end = wanted && system.in_one_pass(w, step.t_new, step.y_new, system.f_at_end.data(),
+                                                           DERIVATIVE_TOO + VALUES_TOO);
+        if (system.has_f_at_end) return add_carried(run, w.carry_hat, w.G);
+    }
+    evaluate_invariants(run, step.t_new, step.y_new);
+}
+
 // Rows along which a correction goes: w.Q, or the gradients as they are where the weights are 1.
 template <class W>
 [[gnu::always_inline]] inline auto *weighed_gradients(const auto &o, const W &w) {
@@ -417,7 +432,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
             rank = come_nearer(of_any_length(run), step, rank);
     }
     add_move(run, step);
-    if (o.compensated || !o.has_limits) evaluate_invariants(run, step.t_new, step.y_new);
+    if (o.compensated || !o.has_limits) evaluate_end(run, step);
     return judge(limits(o, w), origin(step, w), step.y_new, o, w);
 }
 
@@ -469,6 +484,7 @@ inline Code correct(const AnyRun &run, const Step &step, int64_t rank) {
     const auto &w = run.work;
     const Matrix R = corner(w.R, w.l, w);
     start_again(run, step);
+    run.system.has_f_at_end = false;
     weigh_rows(o.frame, w, w.Q);
     const int64_t found = factor(rows_of(w.Q, w), w.inverse_norms, R, w.pivots);
     rank = std::max<int64_t>(0, std::min(rank, found));
@@ -534,7 +550,9 @@ template <class AnyRun>
 inline Code project_step(const AnyRun &run, const Step &step) {
     const auto &o = run.options;
     const auto &w = run.work;
-    const Known known = std::exchange(run.system.at_raw, Known::NOTHING);
+    Known known = std::exchange(run.system.at_raw, Known::NOTHING);
+    if (known == Known::NOTHING && run.system.in_one_pass(w, step.t_new, w.y_hat, nullptr, VALUES_TOO + GRADIENTS_TOO))
+        known = Known::ALL;
     if (known != Known::ALL) gradients(run, step.t_new, w.y_hat, w.last(), w.G);
     ++w.counters[NJEV];
     note_rates(run, step);

@@ -13,15 +13,28 @@ Code with_work(const Run &run, Call call) {
     return call(RunOf<W>{method, options, work, run.system, nullptr});
 }
 
-// Many steps by `call`, which takes a RunOf: where no function is Python's by code of its own for the short states of
-// bodies in two and three dimensions.
+// The lengths of states for which there is code of its own; none in the build for the oldest processors.
+#if defined(__x86_64__) && !defined(__AVX2__)
+using Lengths = std::integer_sequence<int64_t>;
+#else
+using Lengths = std::integer_sequence<int64_t, 2, 3, 4, 6, 8>;
+#endif
+
+template <typename Call, int64_t... M>
+Code by_length_of(const Run &run, Call call, std::integer_sequence<int64_t, M...>) {
+    Code code = OK;
+    const bool found = ((run.work.m == M && (code = with_work<Sized<M>>(run, call), true)) || ...);
+    return found ? code : call(run);
+}
+
+// Many steps by `call`, which takes a RunOf: by code of its own for short states where no function is Python's.
 template <typename Call>
 Code by_length(const Run &run, Call call) {
-    const bool able = !run.system.python && !run.hooks && run.work.n == run.work.m;
-    if (able && run.work.m == 4 && run.work.l == 2 && is_plain(run.method, run.options))
-        return with_work<Plain<4, 2>>(run, call);
-    if (able && run.work.m == 4) return with_work<Sized<4>>(run, call);
-    return able && run.work.m == 6 ? with_work<Sized<6>>(run, call) : call(run);
+    if (run.system.python || run.hooks || run.work.n != run.work.m) return call(run);
+    if constexpr (Lengths::size() > 0)
+        if (run.work.m == 4 && run.work.l == 2 && is_plain(run.method, run.options))
+            return with_work<Plain<4, 2>>(run, call);
+    return by_length_of(run, call, Lengths());
 }
 
 }  // namespace

@@ -27,11 +27,16 @@ using LibraryPointer = void (*)(double t, const T *y, const T *f, T *out, const 
 // `pulls` with the pulls that `accelerate_apart` computes for p bodies.
 using ApartPointer = void (*)(const double *y, double *out, double *pulls, const double *params, int64_t n, int64_t p);
 
-// A problem's functions at one state in one pass, in which they share their terms, with the bits of the functions one by one:
-// the derivative, and the values and the gradients of these invariants; the values alone.
+// The derivative of a state, the values of all invariants of a run and their gradients in one pass, in which they share their
+// terms, with the bits of the functions one by one. Those that are `wanted`, one of the sums in `Wanted`, are filled; returns
+// 0, or another number where a function gives up.
+enum Wanted { DERIVATIVE_TOO = 1, VALUES_TOO = 2, GRADIENTS_TOO = 4 };
+using AllPointer = int (*)(double t, const double *y, double *f, double *values, double *G, const double *params,
+                           int wanted);
+
+// Such a pass over functions of the library: a derivative, whose it is, and these invariants.
 struct Together {
-    void (*all)(const double *y, double *f, double *values, double *G, const double *params);
-    void (*values)(const double *y, double *values, const double *params);
+    AllPointer all;
     std::span<const LibraryPointer<double>> values_alone, gradients_alone;
 };
 

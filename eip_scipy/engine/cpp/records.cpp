@@ -337,6 +337,15 @@ static void take(const LibraryFunction &function, LibraryCall<Lanes8> &place) {
     if (function.own.empty()) place = {function.eight};
 }
 
+// The function at an address.
+template <class Pointer>
+static Pointer pointer_to(nb::handle object, const char *name) {
+    const auto address = static_cast<uintptr_t>(PyLong_AsUnsignedLongLong(object.ptr()));
+    if (PyErr_Occurred()) throw nb::python_error();
+    if (!address) refuse(PyExc_ValueError, "engine: %s contains an address that is 0", name);
+    return reinterpret_cast<Pointer>(address);
+}
+
 // An address, or a function of the library with these sizes that fills the given number of floats.
 template <class Function>
 static Function pointer_of(nb::handle object, const char *name, int64_t floats, int64_t n, int64_t p) {
@@ -350,11 +359,8 @@ static Function pointer_of(nb::handle object, const char *name, int64_t floats, 
         refuse(PyExc_ValueError, "engine: %s fills %lld floats, expected %lld", function->name,
                static_cast<long long>(out.library ? function->filled(n) : 0), static_cast<long long>(floats));
     }
-    const auto address = static_cast<uintptr_t>(PyLong_AsUnsignedLongLong(object.ptr()));
-    if (PyErr_Occurred()) throw nb::python_error();
-    if (!address || floats < 0)
-        refuse(PyExc_ValueError, "engine: %s contains an address that is 0, or a negative number of floats", name);
-    out.pointer = reinterpret_cast<decltype(out.pointer)>(address);
+    out.pointer = pointer_to<decltype(out.pointer)>(object, name);
+    if (floats < 0) refuse(PyExc_ValueError, "engine: %s contains a negative number of floats", name);
     return out;
 }
 
@@ -462,6 +468,13 @@ void read_pointers(nb::handle functions, const Work &w, const Columns &columns, 
     const nb::object jacobian = functions.attr("jacobian");
     if (!jacobian.is_none())
         system.jacobian_pointer = pointer_of<Native<GradientPointer>>(jacobian, "jacobian", w.m / 2, w.m / 2, p);
+    const nb::object together = functions.attr("together");
+    if (!together.is_none()) {
+        require(columns.count == 0 && system.balances.empty() && w.n == w.m,
+                "engine: a pass over all functions of a run with columns, balances or complex states");
+        system.jitted_together = pointer_to<AllPointer>(together, "together");
+    }
+    system.f_at_end.resize(w.m);
     system.scratch.resize(w.m);
     system.scratch_f.resize(w.m);
     if (!system.balances.empty()) system.pulls.resize(w.m / 2);

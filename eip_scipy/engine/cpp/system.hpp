@@ -116,7 +116,10 @@ struct System {
     std::vector<double> scratch, scratch_f, scratch_G, state, slope_of_state;
     std::vector<double> pulls;  // those that come with accelerations
     bool rates_by_pulls = false;
-    const Together *together = nullptr;       // where these are all functions of a problem
+    AllPointer jitted_together = nullptr;  // of a user's functions
+    AllPointer together = nullptr;         // where one pass gives all functions of the run
+    std::vector<double> f_at_end;          // by such a pass, where `has_f_at_end`: the derivative at the end of a step
+    bool has_f_at_end = false;
     const WithEnergy *with_energy = nullptr;  // where the invariant `energy_item` is one that comes with the derivative
     int64_t energy_item = 0;
     double energy = 0.0;
@@ -163,18 +166,25 @@ struct System {
         copy(f + w.m / 2, a, w.m / 2);
     }
 
-    // Computes the derivative at the raw result of a step that will be projected, and the quantities that the same pass gives:
-    // `together` or `with_energy` is set.
+    // Computes what is `wanted` at a state, its derivative into f, in one pass. False where there is no such pass, or it gives up:
+    // the functions have to be called one by one, and that one which fails is then known.
     template <class W>
-    void evaluate_for_projection(const W &w, const double *y, double *out) {
-        if (together) {
-            together->all(y, out, w.values, w.G, params);
+    [[gnu::always_inline]] bool in_one_pass(const W &w, double t, const double *y, double *f, int wanted) {
+        return together && together(t, y, f, w.values, w.G, params, wanted) == 0;
+    }
+
+    // Computes the derivative at the raw result of a step that will be projected, and the quantities that the same pass gives.
+    template <class W>
+    void evaluate_for_projection(const W &w, double t, const double *y, double *out) {
+        if (in_one_pass(w, t, y, out, DERIVATIVE_TOO + VALUES_TOO + GRADIENTS_TOO)) {
             at_raw = Known::ALL;
-        } else {
+        } else if (with_energy) {
             const int64_t half = second_order ? w.m / 2 : 0;
             copy(y + half, out, half);
             energy = with_energy->both(y, params, n_params, out + half);
             at_raw = Known::ENERGY;
+        } else {
+            rhs(w, t, y, out);
         }
     }
 
@@ -194,7 +204,7 @@ struct System {
 
     template <class W>
     void inv(const W &w, double t, const double *y, double *values) {
-        if (together) return together->values(y, values, params);
+        if (together && together(t, y, nullptr, values, nullptr, params, VALUES_TOO) == 0) return;
         if (!by_pointer) return python->all(VALUES, t, y, nullptr, values);
         if (columns) [[unlikely]]
             return call_each(Length{columns->seen}, inv_pointers, "inv", t, state_of(y, state), values);
@@ -250,7 +260,7 @@ struct System {
         choose_energy();
     }
 
-    // Sets `together` if these are the functions of a problem with one pass for all of them, in a run without columns.
+    // Sets `together` if these are a user's functions, or those of a problem, with one pass for all of them.
     void choose_together() {
         const Together *known = rhs_pointer.library.together;
         const auto same = [](const auto &functions, std::span<const LibraryPointer<double>> alone) {
@@ -259,7 +269,7 @@ struct System {
         };
         const bool all = by_pointer && known && !columns && same(inv_pointers, known->values_alone) &&
                          same(grad_pointers, known->gradients_alone);
-        together = all ? known : nullptr;
+        together = all ? known->all : jitted_together;
     }
 
     // Sets `with_energy` if one of the invariants comes with the derivative, in a run without columns.

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
 #include <cstdint>
 
@@ -19,14 +20,33 @@ inline double min(double a, double b) { return std::min(a, b); }
 inline double abs(double x) { return std::abs(x); }
 inline double sqrt(double x) { return std::sqrt(x); }
 inline double where(bool condition, double a, double b) { return condition ? a : b; }
-inline double power(double x, double exponent) { return std::pow(x, exponent); }
+
+// x^exponent for x in [0, 1] and an exponent in [1, 2], to nine digits: for weights, which need no more. By arithmetic that has
+// the same bits on every machine, and without branches, so that loops of it become vectors.
+inline double power(double x, double exponent) {
+    constexpr uint64_t ONE = 0x3ff0000000000000, ROOT = 0x3fe6a09e667f3bcd;  // the bits of 1 and of sqrt(1/2)
+    constexpr double TO_52 = 0x1p52, ROUND = 0x1.8p52, LN2 = 0x1.62e42fefa39efp-1;
+    // x = 2^k m, with m from sqrt(1/2) to sqrt(2); log(m) = 2 artanh(s).
+    const auto bits = std::bit_cast<uint64_t>(x), biased = (bits - ROOT + ONE) >> 52;
+    const double k = std::bit_cast<double>(biased | std::bit_cast<uint64_t>(TO_52)) - (TO_52 + 1023.0);
+    const double m = std::bit_cast<double>(bits - (biased << 52) + ONE), s = (m - 1.0) / (m + 1.0), q = s * s;
+    const double log_m = 2.0 * s * (1.0 + q * (1.0 / 3.0 + q * (1.0 / 5.0 + q * (1.0 / 7.0 + q * (1.0 / 9.0)))));
+    // exp(u + n ln 2)
+    const double y = exponent * (k + log_m * (1.0 / LN2)), rounded = y + ROUND, u = (y - (rounded - ROUND)) * LN2;
+    constexpr double TERMS[] = {1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 1.0 / 2.0, 1.0, 1.0};
+    double sum = 1.0 / 40320.0;
+    for (const double term : TERMS) sum = term + sum * u;
+    const double scale = std::bit_cast<double>((std::bit_cast<uint64_t>(rounded) << 52) + ONE);
+    return x > 1e-150 ? sum * scale : 0.0;
+}
+
 inline bool any(bool condition) { return condition; }
 inline bool any(const Mask &mask) { return mask.any(); }
 
 inline Lanes8 power(const Lanes8 &x, double exponent) {
     double lanes[LANES];
     x.store(lanes);
-    for (double &lane : lanes) lane = std::pow(lane, exponent);
+    for (double &lane : lanes) lane = power(lane, exponent);
     return Lanes8::load(lanes);
 }
 

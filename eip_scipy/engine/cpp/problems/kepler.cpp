@@ -111,27 +111,24 @@ void kepler_momentum_gradient(const Given<T> &g) {
     g.out[3] = g.y[0];
 }
 
-void kepler_values(const double *y, double *values, const double *params) {
-    values[0] = energy_of(Distance(y), y + 2, params[0]);
-    values[1] = momentum_of(y);
-}
-
-void kepler_all(const double *y, double *f, double *values, double *G, const double *params) {
+int kepler_all(double, const double *y, double *f, double *values, double *G, const double *params, int wanted) {
     const Distance distance(y);
     const double w = pull(distance, params[0]);
     const double x = y[0], z = y[1], u = y[2], v = y[3], a = -w * x, b = -w * z;
-    values[0] = energy_of(distance, y + 2, params[0]);
-    values[1] = momentum_of(y);
-    f[0] = u, f[1] = v, f[2] = a, f[3] = b;
-    G[0] = -a, G[1] = -b, G[2] = u, G[3] = v;
-    G[4] = v, G[5] = -u, G[6] = -z, G[7] = x;
+    if (wanted & VALUES_TOO) values[0] = energy_of(distance, y + 2, params[0]), values[1] = momentum_of(y);
+    if (wanted & DERIVATIVE_TOO) f[0] = u, f[1] = v, f[2] = a, f[3] = b;
+    if (wanted & GRADIENTS_TOO) {
+        G[0] = -a, G[1] = -b, G[2] = u, G[3] = v;
+        G[4] = v, G[5] = -u, G[6] = -z, G[7] = x;
+    }
+    return 0;
 }
 
 constexpr LibraryPointer<double> KEPLER_VALUES[] = {plain<double, kepler_energy<double>>,
                                                     plain<double, kepler_momentum<double>>};
 constexpr LibraryPointer<double> KEPLER_GRADIENTS[] = {plain<double, kepler_energy_gradient<double>>,
                                                        plain<double, kepler_momentum_gradient<double>>};
-constexpr Together KEPLER{kepler_all, kepler_values, KEPLER_VALUES, KEPLER_GRADIENTS};
+constexpr Together KEPLER{kepler_all, KEPLER_VALUES, KEPLER_GRADIENTS};
 
 template <class T>
 void harmonic_rhs(const Given<T> &g) {
