@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import DenseOutput, OdeSolution
 
 from ..engine import data
-from ..engine.data import NO_METHOD, Dense, Work
+from ..engine.data import NO_METHOD, Dense, new_work
 from ..engine.native import Call, Engine, PythonFunctions
 from ..methods.base import PROJECTION_ONLY, DenseForm
 from .bound_problem import BoundProblem
@@ -150,7 +150,9 @@ def _record(run: Run, form: DenseForm, events: int) -> Dense:
         shows=run.shows,
         by_travel=invariants > 0 and run.options.metric == data.BY_ERROR,
         options=options,
-        work=Work(n, dtype, stages + further if further else 1, invariants, options.groups.start.size - 1, balances),
+        work=new_work(
+            n, dtype, stages + further if further else 1, invariants, options.blocks.start.size - 1, balances
+        ),
         missed=np.zeros(2),
         waiting=np.zeros(2, np.int64),
         piece=np.zeros(3 + (3 + form.rows) * n * width + 2 * invariants + (2 + form.rows) * balances),
@@ -176,7 +178,7 @@ def _without_functions(form: DenseForm, stages: int, history: Any, n: int, dtype
         )
     none, A = np.zeros(stages), np.zeros((stages, stages))
     run.stepper = NO_METHOD._replace(A=A, b=none, b_low=none, b_v=none, b_v_low=none, c=none, multistep=history)
-    run.work = Work(n, dtype, stages, 0, run.options.groups.start.size - 1)
+    run.work = new_work(n, dtype, stages, 0, run.options.blocks.start.size - 1)
     functions = PythonFunctions(Call(problem.fun, (), (n,), lambda value, t: value), (), (), (), second_order=False)
     engine = Engine(run.stepper, run.options._replace(compensated=history is not None), run.work, functions)
     return Interpolants(run, engine, form=form)

@@ -186,7 +186,7 @@ class ProjectionOptions:
             rtol=stepping.rtol.repeat(width),
             atol=stepping.atol,
             block_atol=_block_atol(stepping.atol, groups),
-            groups=groups,
+            blocks=groups,
             frame=NO_LINEAR_ROWS if linear is None else linear_rows(linear, n, width),
             balances=balances,
             balance_groups=balance_groups,
@@ -230,7 +230,7 @@ class ProjectionOptions:
                 (label, item.target, item.scale) for label, item in zip(known.labels, known.items, strict=True)
             ],
             "metric": metric,
-            "blocks": (options.groups.start, options.groups.member),
+            "blocks": (options.blocks.start, options.blocks.member),
             "every": "auto" if options.every == data.AUTO else options.every,
             "project_initial": bool(self.project_initial),
         }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from ..engine import data
-from ..engine.data import EPS, NOTHING, OK, PENDING, REASON, Schedule, Work, bare_schedule
+from ..engine.data import EPS, NOTHING, OK, PENDING, REASON, Schedule, Work, bare_schedule, new_work
 from ..engine.native import BUILD, Call, Engine, NativeFunctions, PythonFunctions
 from ..engine.trust import Trust
 from ..methods.base import PROJECTION_ONLY, Method
@@ -166,9 +166,9 @@ class Run:
         self.options, sigma = self.tangents.options(options, sigma, invariants.start_gradients)
         invariants.kinds = options.kinds
         self.stepper = method.for_engine(self.problem.sees_velocity)
-        carried, blocks = options.balances.place, options.groups.start.size - 1
+        carried, blocks = options.balances.place, options.blocks.start.size - 1
         size = self.stepper.b.size
-        self.work = work = Work(start.y.size, start.y.dtype, size, invariants.size, blocks, carried.size)
+        self.work = work = new_work(start.y.size, start.y.dtype, size, invariants.size, blocks, carried.size)
         work.values[:], work.G[:] = invariants.start_values, invariants.start_gradients
         work.counters[data.FROM_F] = masses.size > 0
         del invariants.start_gradients  # which may be large
@@ -232,7 +232,7 @@ class Run:
             metric=data.EUCLIDEAN, direction=data.NEW, iterations=START_ITERATIONS, compensated=False, watched=False,
             limit=np.inf,
         )  # fmt: skip
-        work = Work(y0.size, y0.dtype, 0, self.invariants.size, options.groups.start.size - 1)
+        work = new_work(y0.size, y0.dtype, 0, self.invariants.size, options.blocks.start.size - 1)
         work.K[-1] = f0
         y = self.projected(t0, y0, options, work)
         if self.invariants.misses(t0, y, f0).any():
@@ -400,7 +400,7 @@ class Run:
     @cached_property
     def examiner(self) -> Examiner:
         """Return the `Examiner` of the run's steps and states."""
-        resolution = partial(unresolved, self.stepper, self.options.groups)
+        resolution = partial(unresolved, self.stepper, self.options.blocks)
         return Examiner(self.invariants, self.invariants.tau, self.work.trust, resolution)
 
 

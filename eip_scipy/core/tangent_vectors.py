@@ -129,9 +129,9 @@ class TangentVectors:
             kept=np.cumsum(G[:, places, None] * self.initial, axis=1)[:, -1].copy(), size=self.size, seen=self.n,
             half=self.n // 2 if self.in_halves else 0, symplectic=self.symplectic,
         )  # fmt: skip
-        blocks, kinds = (item._replace(member=moved(item.member), size=0) for item in (options.groups, options.kinds))
+        blocks, kinds = (item._replace(member=moved(item.member), size=0) for item in (options.blocks, options.kinds))
         options = options._replace(
-            rtol=self.spread(options.rtol), atol=self.spread(options.atol), groups=blocks, kinds=kinds, columns=vectors,
+            rtol=self.spread(options.rtol), atol=self.spread(options.atol), blocks=blocks, kinds=kinds, columns=vectors,
             joint=None, metric=GIVEN if options.metric == EUCLIDEAN and self.parameters else options.metric,
             frame=options.frame._replace(bodies=np.zeros((2, 0, 0)), place=moved(options.frame.place)),
         )  # fmt: skip

@@ -126,172 +126,8 @@ SOURCES: str = ...
 COMPILER: str
 HAS_V3: bool
 
-class Work:
-    """
-    Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.
-    """
-
-    def __init__(self, n: int, dtype: object, stages: int, n_invariants: int, n_blocks: int, n_balances: int = 0) -> None: ...
-
-    def arrays(self) -> dict[str, numpy.typing.NDArray[Any]]:
-        """Return all arrays by name."""
-
-    def __getstate__(self) -> tuple[Any, ...]: ...
-
-    def __setstate__(self, arg: tuple[Any, ...], /) -> None: ...
-
-    @property
-    def K(self, /) -> numpy.ndarray: ...
-
-    @property
-    def stage(self, /) -> numpy.ndarray: ...
-
-    @property
-    def y_hat(self, /) -> numpy.ndarray: ...
-
-    @property
-    def f_point(self, /) -> numpy.ndarray: ...
-
-    @property
-    def G(self, /) -> numpy.ndarray: ...
-
-    @property
-    def err(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def err_low(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def err_sum(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def sigma(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def move(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def shift(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def unit(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def carry(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def carry_hat(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def scale(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inverse(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def ratio(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def remembered(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def memory(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def memory_new(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def B(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def Q(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def R(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inverse_norms(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def mu(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def values(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def g(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def band(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def before(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def worth(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def residual(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def max_residual(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def max_correction(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def norm(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def trust(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def flow(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def rates(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def level(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def level_old(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def level_carry(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def level_carry_new(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def slow(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def suspect(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def pivots(self, /) -> numpy.typing.NDArray[numpy.int64]: ...
-
-    @property
-    def counters(self, /) -> numpy.typing.NDArray[numpy.int64]: ...
-
-    @property
-    def inner_matrix(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inner_R(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inner_g(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inner_inverse_norms(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inner_mu(self, /) -> numpy.typing.NDArray[numpy.float64]: ...
-
-    @property
-    def inner_pivots(self, /) -> numpy.typing.NDArray[numpy.int64]: ...
+def new_work(n: int, dtype: Any, stages: int, n_invariants: int, n_blocks: int, n_balances: int = 0) -> Work:
+    """Return the buffers of a run."""
 
 class Engine:
     """
@@ -300,60 +136,55 @@ class Engine:
 
     def __init__(self, method: Any, options: Options, work: Work, functions: Any, schedule: Schedule | None = None, hooks: Any = None) -> None: ...
 
-    def advance(self, k_end: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64], y_saved: numpy.typing.NDArray[numpy.inexact], pieces: numpy.typing.NDArray[numpy.float64] | None) -> int:
+    def advance(self, k_end: int, y: object, y_new: object, t_saved: object, y_saved: object, pieces: object | None) -> int:
         """
-        Make steps up to step `k_end`, or until something else stops the loop, and return the reason as a code. If `pieces` (rows, floats) has rows, it is filled with the interpolants of all steps.
-        """
-
-    def sweep(self, members: object, steps: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64]) -> int:
-        """
-        Run members of an ensemble one after the other, for `steps` steps in all (slightly more if a multistep method is near its end). Return OK, or a code for what happened to the current member. `members.where` holds the current member and whether it has begun.
+        Make steps up to step `k_end`, or until something else stops the loop, and return the reason as a code. With dense output, `pieces` (rows, floats) is filled with the interpolants of all steps if it has rows.
         """
 
     def side_by_side(self, functions: object) -> None:
         """
-        Set the functions for eight members with which `sweep_octets` runs members from now on. Like those of the run, `functions` holds addresses.
+        Let `sweep` run members in batches of eight from now on, with these functions for eight members.
         """
 
-    def sweep_octets(self, members: object, steps: int, y: numpy.typing.NDArray[numpy.inexact], y_new: numpy.typing.NDArray[numpy.inexact], t_saved: numpy.typing.NDArray[numpy.float64]) -> int:
+    def sweep(self, members: object, steps: int, y: object, y_new: object) -> int:
         """
-        Run members like `sweep`, in batches of eight that step together; `steps` counts steps of a batch. A member whose status is not set afterwards must be run alone.
+        Run members of an ensemble for `steps` steps in all, or slightly more. Return OK, or a code for what happened to the current member. A member of a batch whose status is not set must be run alone.
         """
 
-    def step(self, k: int, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> tuple[int, float, numpy.ndarray, numpy.ndarray]:
+    def step(self, k: int, t: float, y: object, f: object) -> tuple[int, float, numpy.ndarray, numpy.ndarray]:
         """
         Make step `k` from the state `y` at time `t`, where the derivative is `f`. Return (status, t_new, y_new, f_new).
         """
 
-    def project(self, t_old: float, y: numpy.typing.NDArray[numpy.inexact], t: float, last: bool, y_new: numpy.typing.NDArray[numpy.inexact]) -> int:
+    def project(self, t_old: float, y: object, t: float, last: bool, y_new: object) -> int:
         """
         Project the state work.y_hat onto the invariants, write the result to `y_new`, and return the code.
         """
 
-    def values(self, t: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.inexact], out: numpy.typing.NDArray[numpy.float64], params: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
+    def values(self, t: object, y: object, out: object, params: object | None = None) -> None:
         """
-        Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n). If `params` (m, p) is given, each state has its own row of parameters.
+        Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n), each with its own row of parameters if `params` (m, p) is given.
         """
 
-    def start(self, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], tau: float) -> None:
+    def start(self, y: object, f: object, tau: float) -> None:
         """
-        Set the sizes of the invariants' terms at the start of a run, from the state `y`, the derivative `f`, the length `tau` of a step, work.values and the gradients work.G.
+        Set the sizes of the invariants' terms at the start, where work.values and work.G are known.
         """
 
     def sample(self, dense: object) -> None:
-        """Make dense output from now on, with the buffers of the record `dense`."""
+        """Make dense output from now on, as the record `dense` says."""
 
-    def describe(self, t_old: float, y_old: numpy.typing.NDArray[numpy.inexact], t: float, y: numpy.typing.NDArray[numpy.inexact], piece: numpy.typing.NDArray[numpy.float64]) -> None:
+    def describe(self, t_old: float, y_old: object, t: float, y: object, piece: object) -> None:
         """
         Fill `piece` with the interpolant over the last step, from (t_old, y_old) to (t, y).
         """
 
-    def interpolate(self, piece: numpy.typing.NDArray[numpy.float64], t: numpy.typing.NDArray[numpy.float64], out: numpy.typing.NDArray[numpy.inexact]) -> None:
+    def interpolate(self, piece: object, t: object, out: object) -> None:
         """
         Fill `out` (m, n) with the states at the times `t` (m,), computed with the interpolant `piece`.
         """
 
-    def show(self, t: float, y: numpy.typing.NDArray[numpy.inexact], out: numpy.typing.NDArray[numpy.inexact]) -> None:
+    def show(self, t: float, y: object, out: object) -> None:
         """
         Fill `out` (n,) with the state `y` at `t` in the form in which the run saves its last state.
         """
@@ -367,9 +198,7 @@ class LibraryFunction:
 
     @property
     def takes_f(self) -> bool:
-        """
-        True if the function takes the derivative f of the state as an argument.
-        """
+        """True if the function takes the derivative f of the state."""
 
     @property
     def in_place(self) -> bool:
@@ -379,9 +208,7 @@ class LibraryFunction:
 
     @property
     def handle(self) -> int:
-        """
-        Address of this function's record, the first argument of the function at `call_address`.
-        """
+        """First argument of the function at `call_address`."""
 
     @property
     def call_address(self) -> int:
@@ -390,7 +217,7 @@ class LibraryFunction:
     @property
     def numbers(self) -> int:
         """
-        Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its absolute value is the number for each orbit.
+        Number of numbers, or of rows of the state's size, that are filled; if negative, that for each orbit.
         """
 
     @property
@@ -400,12 +227,12 @@ class LibraryFunction:
         """
 
     @property
-    def octet_address(self) -> int:
+    def lanes8_address(self) -> int:
         """Address of the version for eight states at once; 0 if there is none."""
 
     def bound(self, params: object) -> LibraryFunction:
         """
-        Return the function with fixed parameters `params`, which it uses instead of the parameters of a run.
+        Return the function with fixed parameters, which it uses instead of those of a run.
         """
 
     @property
@@ -419,7 +246,7 @@ class LibraryFunction:
     def __reduce__(self) -> tuple[Any, ...]: ...
 LIBRARY: dict[Any, Any] = ...
 
-def are_finite(numbers: numpy.typing.NDArray[numpy.float64]) -> bool:
+def are_finite(numbers: object) -> bool:
     """Return True if no number is NaN or infinite."""
 
 class RightHandSide:
@@ -432,7 +259,7 @@ class RightHandSide:
     def __call__(self, t: object, y: object) -> numpy.ndarray:
         """Return the derivative (n,) at (t, y), a new array."""
 
-    def derivatives(self, times: numpy.typing.NDArray[numpy.float64], y: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+    def derivatives(self, times: object, y: object) -> numpy.ndarray:
         """
         Return the derivatives (m, n) at times (m,) and states (m, n); NaN where the function raises an exception.
         """
@@ -442,31 +269,29 @@ class InvariantFunctions:
 
     def __init__(self, values: tuple[Any, ...], gradients: tuple[Any, ...], n: int, is_complex: bool) -> None: ...
 
-    def values(self, t: float, y: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+    def values(self, t: float, y: object) -> numpy.ndarray:
         """Return all values (l,)."""
 
-    def gradients(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> numpy.ndarray:
+    def gradients(self, t: float, y: object, f: object) -> numpy.ndarray:
         """Return all gradients (l, n)."""
 
-    def is_in_order(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
+    def is_in_order(self, t: float, y: object, f: object, G: object, here: object, tau: float, interval: tuple[float, float], directions: object) -> bool:
         """
-        Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where the gradients are `G` and the values are `here`.
-        """
-
-    def look(self, figures: numpy.typing.NDArray[numpy.float64], t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], tau: float, interval: tuple[float, float], directions: numpy.typing.NDArray[numpy.inexact]) -> bool:
-        """
-        Call `note_rates` and `is_in_order` for a state of a run without balances, and return the latter's result. If `f` is not finite, return True and note nothing.
+        Return True if the checks of precision, gradients `G` and invariance find nothing.
         """
 
-    def rates_by_values(self, t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:
+    def look(self, figures: object, t: float, y: object, f: object, target: object, scales: object, tau: float, interval: tuple[float, float], directions: object) -> bool:
         """
-        Return the rates of change (l,) of the invariants along `f`, by short differences to both sides. A rate is NaN if the two differences disagree, as at a kink, and 0 if it is within the rounding errors of the values.
+        Call `note_rates` and return `is_in_order`, for a state of a run without balances.
         """
 
-    def note_rates(self, figures: numpy.typing.NDArray[numpy.float64], t: float, y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], G: numpy.typing.NDArray[numpy.inexact], here: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64], scales: numpy.typing.NDArray[numpy.float64], own: numpy.typing.NDArray[numpy.float64] | None = None) -> None:
+    def rates_by_values(self, t: float, y: object, f: object, G: object, here: object, target: object, scales: object) -> numpy.ndarray:
         """
-        Update the largest rates of change along `f` in `figures` (l, N_FIGURES), computed from gradients and from values. The rates are relative to their terms, and the rates `own` of balances are subtracted first.
+        Return the rates of change (l,) of the invariants along `f`, by short differences.
         """
+
+    def note_rates(self, figures: object, t: float, y: object, f: object, G: object, here: object, target: object, scales: object, own: object | None = None) -> None:
+        """Update the largest rates of change along `f` in `figures`."""
 CHECK_STEP: float = 6e-06
 CHECK_TOLERANCE: float = 0.0001
 CHECK_NOISE: float = 6.0
@@ -474,32 +299,32 @@ INVARIANCE_TOLERANCE: float = 1e-08
 TIME_SHARE: float = 0.01
 TIME_ROOM: float = 5.0
 
-def time_of_motion(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> float:
+def time_of_motion(y: object, f: object) -> float:
     """
     Return the time in which a state changes by its own size; infinite if it or its derivative `f` is 0.
     """
 
-def typical_sizes(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], tau: float) -> numpy.ndarray:
+def typical_sizes(y: object, f: object, tau: float) -> numpy.ndarray:
     """
     Return for each component a size that is added to |y_k|, so that shifts do not vanish with the component: ``abs(tau * f[k])``, the motion in a step of length `tau`, and at least 1e-3 |y_k|. If both are 0, it is the largest size of the other components, or 1 if all are 0.
     """
 
-def is_canonical(y: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> bool:
+def is_canonical(y: object, f: object) -> bool:
     """
     Return True if a state y with the derivative f is taken as (q, p): it is real and has an even number n of components, ``f[: n // 2]`` and ``p = y[n // 2 :]`` are both zero or both nonzero, and the sum of ``f[: n // 2] * sign(p)`` is not negative.
     """
 
-def states_near(y: numpy.typing.NDArray[numpy.inexact], sizes: numpy.typing.NDArray[numpy.float64], ways: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray:
+def states_near(y: object, sizes: object, ways: object) -> numpy.ndarray:
     """
     Return the states ``y + ways * sizes``, (m, n). Components that are 0 at y become positive.
     """
 
-def are_independent(F: numpy.typing.NDArray[numpy.float64]) -> bool:
+def are_independent(F: object) -> bool:
     """
     Return True if the columns of F (m, n), with rows and then columns in units of their largest entries, are clearly independent; False too if there are more than 24 columns, or a number is not finite.
     """
 
-def raise_residuals(largest: numpy.typing.NDArray[numpy.float64], values: numpy.typing.NDArray[numpy.float64], target: numpy.typing.NDArray[numpy.float64]) -> None:
+def raise_residuals(largest: object, values: object, target: object) -> None:
     """
     Raise `largest` (l,) to the distances of the values (m, l) from the target (l,); NaN does not count.
     """
@@ -610,7 +435,7 @@ class Options(NamedTuple):
     rtol: numpy.typing.NDArray[numpy.float64]
     atol: numpy.typing.NDArray[numpy.float64]
     block_atol: numpy.typing.NDArray[numpy.float64]
-    groups: Grouping
+    blocks: Grouping
     frame: FrameRows
     balances: Balances
     balance_groups: Groups
@@ -637,16 +462,17 @@ class Options(NamedTuple):
     joint: Any = ...
 
 class Members(NamedTuple):
-    starts: numpy.typing.NDArray[numpy.inexact]
+    starts: numpy.typing.NDArray[Any]
     params: numpy.typing.NDArray[numpy.float64]
     first_steps: numpy.typing.NDArray[numpy.float64]
     events: numpy.typing.NDArray[numpy.float64]
     evaluations: int
     sigma: numpy.typing.NDArray[numpy.float64]
     left: numpy.typing.NDArray[numpy.float64]
+    t_saved: numpy.typing.NDArray[numpy.float64]
     kept: bool
-    rows: numpy.typing.NDArray[numpy.inexact]
-    y: numpy.typing.NDArray[numpy.inexact]
+    rows: numpy.typing.NDArray[Any]
+    y: numpy.typing.NDArray[Any]
     t: numpy.typing.NDArray[numpy.float64]
     status: numpy.typing.NDArray[numpy.int64]
     max_residual: numpy.typing.NDArray[numpy.float64]
@@ -671,42 +497,95 @@ class Dense(NamedTuple):
     piece: numpy.typing.NDArray[numpy.float64]
     event: numpy.typing.NDArray[numpy.int64]
     t: numpy.typing.NDArray[numpy.float64]
-    y: numpy.typing.NDArray[numpy.inexact]
+    y: numpy.typing.NDArray[Any]
     counts: numpy.typing.NDArray[numpy.int64]
     left: numpy.typing.NDArray[numpy.float64]
     pending_event: numpy.typing.NDArray[numpy.int64]
     pending_t: numpy.typing.NDArray[numpy.float64]
 
+class Work(NamedTuple):
+    K: numpy.typing.NDArray[Any]
+    stage: numpy.typing.NDArray[Any]
+    y_hat: numpy.typing.NDArray[Any]
+    f_point: numpy.typing.NDArray[Any]
+    G: numpy.typing.NDArray[Any]
+    err: numpy.typing.NDArray[numpy.float64]
+    err_low: numpy.typing.NDArray[numpy.float64]
+    err_sum: numpy.typing.NDArray[numpy.float64]
+    sigma: numpy.typing.NDArray[numpy.float64]
+    move: numpy.typing.NDArray[numpy.float64]
+    shift: numpy.typing.NDArray[numpy.float64]
+    unit: numpy.typing.NDArray[numpy.float64]
+    carry: numpy.typing.NDArray[numpy.float64]
+    carry_hat: numpy.typing.NDArray[numpy.float64]
+    scale: numpy.typing.NDArray[numpy.float64]
+    inverse: numpy.typing.NDArray[numpy.float64]
+    ratio: numpy.typing.NDArray[numpy.float64]
+    remembered: numpy.typing.NDArray[numpy.float64]
+    memory: numpy.typing.NDArray[numpy.float64]
+    memory_new: numpy.typing.NDArray[numpy.float64]
+    B: numpy.typing.NDArray[numpy.float64]
+    Q: numpy.typing.NDArray[numpy.float64]
+    R: numpy.typing.NDArray[numpy.float64]
+    inverse_norms: numpy.typing.NDArray[numpy.float64]
+    mu: numpy.typing.NDArray[numpy.float64]
+    values: numpy.typing.NDArray[numpy.float64]
+    g: numpy.typing.NDArray[numpy.float64]
+    band: numpy.typing.NDArray[numpy.float64]
+    before: numpy.typing.NDArray[numpy.float64]
+    worth: numpy.typing.NDArray[numpy.float64]
+    residual: numpy.typing.NDArray[numpy.float64]
+    max_residual: numpy.typing.NDArray[numpy.float64]
+    max_correction: numpy.typing.NDArray[numpy.float64]
+    norm: numpy.typing.NDArray[numpy.float64]
+    trust: numpy.typing.NDArray[numpy.float64]
+    flow: numpy.typing.NDArray[numpy.float64]
+    rates: numpy.typing.NDArray[numpy.float64]
+    level: numpy.typing.NDArray[numpy.float64]
+    level_old: numpy.typing.NDArray[numpy.float64]
+    level_carry: numpy.typing.NDArray[numpy.float64]
+    level_carry_new: numpy.typing.NDArray[numpy.float64]
+    slow: numpy.typing.NDArray[numpy.float64]
+    suspect: numpy.typing.NDArray[numpy.float64]
+    pivots: numpy.typing.NDArray[numpy.int64]
+    counters: numpy.typing.NDArray[numpy.int64]
+    inner_matrix: numpy.typing.NDArray[numpy.float64]
+    inner_R: numpy.typing.NDArray[numpy.float64]
+    inner_g: numpy.typing.NDArray[numpy.float64]
+    inner_inverse_norms: numpy.typing.NDArray[numpy.float64]
+    inner_mu: numpy.typing.NDArray[numpy.float64]
+    inner_pivots: numpy.typing.NDArray[numpy.int64]
+
 class condensates:
     @staticmethod
-    def multiply(field: numpy.typing.NDArray[numpy.inexact], factor: numpy.typing.NDArray[numpy.float64]) -> None: ...
+    def multiply(field: numpy.typing.NDArray[numpy.complex128], factor: numpy.typing.NDArray[numpy.float64]) -> None: ...
     @staticmethod
-    def derivative(rest: numpy.typing.NDArray[numpy.inexact], psi: numpy.typing.NDArray[numpy.inexact], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.inexact]) -> None: ...
+    def derivative(rest: numpy.typing.NDArray[numpy.complex128], psi: numpy.typing.NDArray[numpy.complex128], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.complex128]) -> None: ...
     @staticmethod
-    def derivative_at_once(psi: numpy.typing.NDArray[numpy.inexact], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.inexact]) -> None: ...
+    def derivative_at_once(psi: numpy.typing.NDArray[numpy.complex128], V: numpy.typing.NDArray[numpy.float64], beta: float, out: numpy.typing.NDArray[numpy.complex128]) -> None: ...
     @staticmethod
-    def turn(f: numpy.typing.NDArray[numpy.inexact], factor: float, out: numpy.typing.NDArray[numpy.inexact]) -> None: ...
+    def turn(f: numpy.typing.NDArray[numpy.complex128], factor: float, out: numpy.typing.NDArray[numpy.complex128]) -> None: ...
     @staticmethod
-    def moments(psi: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> list[float]: ...
+    def moments(psi: numpy.typing.NDArray[numpy.complex128], f: numpy.typing.NDArray[numpy.complex128]) -> list[float]: ...
     @staticmethod
-    def total_mass(psi: numpy.typing.NDArray[numpy.inexact]) -> float: ...
+    def total_mass(psi: numpy.typing.NDArray[numpy.complex128]) -> float: ...
     @staticmethod
-    def expansion(psi: numpy.typing.NDArray[numpy.inexact], near: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact]) -> list[float]: ...
+    def expansion(psi: numpy.typing.NDArray[numpy.complex128], near: numpy.typing.NDArray[numpy.complex128], f: numpy.typing.NDArray[numpy.complex128]) -> list[float]: ...
     @staticmethod
-    def shifted(psi: numpy.typing.NDArray[numpy.inexact], f: numpy.typing.NDArray[numpy.inexact], a: float, b: float, out: numpy.typing.NDArray[numpy.inexact]) -> list[float]: ...
+    def shifted(psi: numpy.typing.NDArray[numpy.complex128], f: numpy.typing.NDArray[numpy.complex128], a: float, b: float, out: numpy.typing.NDArray[numpy.complex128]) -> list[float]: ...
     @staticmethod
-    def weighted_square(field: numpy.typing.NDArray[numpy.inexact], weight: numpy.typing.NDArray[numpy.float64]) -> float: ...
+    def weighted_square(field: numpy.typing.NDArray[numpy.complex128], weight: numpy.typing.NDArray[numpy.float64]) -> float: ...
 
 class gradients:
     @staticmethod
-    def complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float) -> numpy.ndarray:
+    def complex_step(fun: object, t: object, y: object, args: tuple[Any, ...], step: float) -> numpy.ndarray:
         """
-        Return the derivatives (..., n) of ``fun(t, y, *args)`` with respect to the components of `y` (n,), by complex steps of length `step`.
+        Return the derivatives (..., n) of ``fun(t, y, *args)`` by `y` (n,), by complex steps of this length.
         """
     @staticmethod
-    def checked_complex_step(fun: object, t: object, y: numpy.typing.NDArray[numpy.float64], args: tuple[Any, ...], step: float, direction: numpy.typing.NDArray[numpy.float64], floors: numpy.typing.NDArray[numpy.float64]) -> numpy.ndarray | None:
+    def checked_complex_step(fun: object, t: object, y: object, args: tuple[Any, ...], step: float, direction: object, floors: object) -> numpy.ndarray | None:
         """
-        Return the value of `complex_step`, or None if it disagrees with differences of ``fun`` along ``direction * (abs(y) + floors)``, as it does if ``fun`` is not analytic.
+        Return `complex_step`, or None if differences along ``direction * (abs(y) + floors)`` disagree with it.
         """
 
 class multibody:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 __all__ = [
-    "BUILD", "Call", "Engine", "FailedCallError", "Hooks", "LibraryFunction", "NativeFunctions", "OctetFunctions",
+    "BUILD", "BatchFunctions", "Call", "Engine", "FailedCallError", "Hooks", "LibraryFunction", "NativeFunctions",
     "PythonFunctions", "Rates", "call", "library", "library_function", "working_alone",
 ]  # fmt: skip
 
@@ -112,7 +112,7 @@ class NativeFunctions(NamedTuple):
     native: bool = True
 
 
-class OctetFunctions(NamedTuple):
+class BatchFunctions(NamedTuple):
     """Functions that compute eight members of an ensemble at once; their arrays hold eight numbers in place of one."""
 
     rhs: Any

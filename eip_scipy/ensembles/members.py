@@ -22,7 +22,7 @@ from ..core.inputs import shown
 from ..core.runs import Run
 from ..core.step_control import UNBOUNDED, saved_steps
 from ..engine import data
-from ..engine.native import BUILD, LibraryFunction, OctetFunctions
+from ..engine.native import BUILD, BatchFunctions, LibraryFunction
 from ..engine.trust import Trust, exceed_bounds, suspects
 from ..run.driver import Driver, expected_steps
 from ..run.integrate import ARRIVED, ENDED_BY_EVENT, Loop, assembled
@@ -267,7 +267,7 @@ class BatchRunner:
         first_steps, events = self._at_start(y0s, params)
         return data.Members(
             starts=y0s, params=params, first_steps=first_steps, events=events, evaluations=self._evaluations,
-            sigma=self._sigma, left=self._left, kept=kept, where=np.zeros(2, np.int64),
+            sigma=self._sigma, left=self._left, t_saved=self._driver.t, kept=kept, where=np.zeros(2, np.int64),
             rows=np.empty((m if kept else 1, *self._driver.y.shape), y0s.dtype),
             counters=np.zeros((m, data.N_COUNTERS), np.int64),
             figures=np.zeros((m, *self._driver.run.work.trust.shape)),
@@ -299,9 +299,6 @@ class BatchRunner:
     def _advance(self, each: data.Members, out: dict[str, Any]) -> bool:
         """Make some steps; return False if the current member must run alone, and go to the next one then."""
         driver, first = self._driver, int(each.where[0])
-        if not self.not_batched_because:
-            driver.sweep_octets(each, self._steps)
-            return True
         try:
             code = driver.sweep(each, self._steps)
         except Exception:  # of a user's function; it is raised again when the member runs alone
@@ -489,7 +486,7 @@ def not_batched_because(driver: Driver, members: int) -> str:
     except NotCompilableError as error:
         return str(error)
     product = jacobian[0][0] if jacobian else None
-    driver.engine.side_by_side(OctetFunctions(rhs[0][0], inv, grad, driver.functions, product))
+    driver.engine.side_by_side(BatchFunctions(rhs[0][0], inv, grad, driver.functions, product))
     return ""
 
 
@@ -500,7 +497,7 @@ def _for_lanes(native: CompiledFunction, little: bool) -> tuple[Any, int]:
     """
     one: Any = native.function
     if isinstance(one, LibraryFunction):
-        if not one.octet_address:
+        if not one.lanes8_address:
             raise NotCompilableError(f"{one.__name__} of this package is written for one member at a time")
         return one, native.floats
     if isinstance(one, PointerFunction):

@@ -81,19 +81,12 @@ class Driver:
     def sweep(self, members: Members, steps: int) -> int:
         """Run members of an ensemble, starting at `members.where`, for `steps` steps in total, on this run's buffers.
 
-        Return `OK`, also if more calls are needed, or the code of what happened to the current member.
+        Return `OK`, also if more calls are needed, or the code of what happened to the current member. Members of
+        batches whose status is not set afterwards must be run individually.
         """
-        code = int(self._call(self.engine.sweep, members, steps, self.state, self.new, self.t))
+        code = int(self._call(self.engine.sweep, members, steps, self.state, self.new))
         self.warn()
         return code
-
-    def sweep_octets(self, members: Members, steps: int) -> None:
-        """Run members in batches of eight until all have ended or `steps` steps of batches are made.
-
-        Members whose status is not set afterwards must be run individually.
-        """
-        self.engine.sweep_octets(members, steps, self.state, self.new, self.t)
-        self.warn()
 
     def _call(self, function: Callable[..., Any], *given: Any) -> Any:
         """Return ``function(*given)``, of the engine, with the errors of `own_errors`."""

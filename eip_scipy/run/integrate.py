@@ -456,8 +456,8 @@ class Loop:
         last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
         arguments = {**asked._asdict(), **asked.projection, "params": copy(asked.params)}  # the user may change it
         del arguments["projection"]
-        figures, rows = run.trust.figures, slice(driver.rows - 1, driver.rows)
-        saved = driver.rows > 0 and driver.t[rows] == t and np.array_equal(driver.y[rows], y[None])
+        figures = run.trust.figures
+        saved = rows > 0 and driver.t[rows - 1] == t and np.array_equal(driver.y[rows - 1], y)
         origin = Origin(
             arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign, tuple(run.invariants.names),
             terms=np.where(np.isnan(target), np.inf, figures[:, START]),  # balances have no target

@@ -56,7 +56,7 @@ def test_what_cannot_be_taken():
     with pytest.raises(ZeroDivisionError):
         complex_step(lambda t, y: 1 / 0, 0.0, Y, (), STEP)
     for y in ([0.3], Y.astype(complex), Y.astype(np.float32), Y[::2], np.zeros((2, 2)), None):
-        with pytest.raises(TypeError, match="incompatible function arguments"):
+        with pytest.raises((TypeError, ValueError), match=r"engine: y is .*expected|incompatible"):
             complex_step(product, 0.0, y, (), STEP)
     with pytest.raises(ValueError, match="one number or more"):
         complex_step(product, 0.0, np.empty(0), (), STEP)

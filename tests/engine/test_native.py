@@ -15,7 +15,7 @@ from systems import SPIN_NORM, SPIN_START, H, orbit, pericentre, spin
 from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12
 from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
-from eip_scipy.engine.data import Work
+from eip_scipy.engine.data import new_work
 from eip_scipy.engine.native import BUILD, Engine
 from eip_scipy.run.prepare import RunArguments, prepared
 
@@ -103,9 +103,9 @@ def test_arrays_that_do_not_fit_are_refused(case):
 
 
 WRONG_RECORDS = [
-    ("options", "groups", lambda g: g._replace(member=g.member + np.uint64(9))),
-    ("options", "groups", lambda g: g._replace(start=g.start[::-1].copy())),
-    ("options", "groups", lambda g: g._replace(width=3)),
+    ("options", "blocks", lambda g: g._replace(member=g.member + np.uint64(9))),
+    ("options", "blocks", lambda g: g._replace(start=g.start[::-1].copy())),
+    ("options", "blocks", lambda g: g._replace(width=3)),
     ("options", "frame", lambda f: f._replace(place=f.place + np.uint64(4))),
     ("options", "frame", lambda f: f._replace(start=f.start + np.uint64(1))),
     ("options", "every", lambda every: -1),
@@ -136,12 +136,12 @@ def test_buffers_that_do_not_fit_are_refused():
     for place, value in enumerate((5, complex, 3, 2, 9)):
         sizes = [*fitting[:place], value, *fitting[place + 1 :]]
         with pytest.raises((TypeError, ValueError), match="engine: "):
-            Engine(**given | {"work": Work(*sizes)})
-    with pytest.raises(TypeError, match="work: Work"):
-        Engine(**given | {"work": None})
+            Engine(**given | {"work": new_work(*sizes)})
+    with pytest.raises(TypeError, match="engine: work"):
+        Engine(**given | {"work": ()})
     for sizes in ((-1, float, 4, 1, 2), (4, float, -1, 1, 2), (4, np.float32, 4, 1, 2), (4, "nothing", 4, 1, 2)):
         with pytest.raises((TypeError, ValueError)):
-            Work(*sizes)
+            new_work(*sizes)
 
 
 def test_calls_with_wrong_arguments():

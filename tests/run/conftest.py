@@ -22,7 +22,7 @@ def fine(monkeypatch):
     def poisoned(driver, *rows):
         known = [a.copy() for a in driver.parts().values()]
         w, grid = driver.run.work, driver.schedule
-        for buffer in (*w.arrays().values(), grid.g_new, driver.new, driver.t, driver.y):
+        for buffer in (*w, grid.g_new, driver.new, driver.t, driver.y):
             buffer[...] = np.nan if buffer.dtype.kind in "fc" else 77
         for part, value in zip(driver.parts().values(), known, strict=True):
             part[...] = value

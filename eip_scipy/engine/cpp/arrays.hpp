@@ -1,6 +1,5 @@
-// Arguments that are NumPy arrays. Each array is checked before its memory is used: its type against the one that the
-// function asks for, or its lengths against those of the run. This header must be included before all headers of the
-// standard library, because Python.h requires that.
+// Arguments that are NumPy arrays: `memory` checks the type and the shape of each one before its memory is used. This header
+// must be included before all headers of the standard library, because Python.h requires that.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -14,12 +13,15 @@
 #include <numpy/arrayobject.h>
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <chrono>
 #include <initializer_list>
-#include <optional>
+#include <span>
 #include <thread>
 #include <type_traits>
+
+#include "data.hpp"
 
 namespace eip {
 
@@ -76,83 +78,30 @@ inline bool is_plain(PyObject *object, int type, int axes) {
     return PyArray_TYPE(array) == type && PyArray_NDIM(array) == axes && PyArray_ISCARRAY_RO(array);
 }
 
-inline bool is_plain(PyObject *object, int type, Lengths shape) {
-    if (!is_plain(object, type, static_cast<int>(shape.size()))) return false;
-    return std::equal(shape.begin(), shape.end(), PyArray_DIMS(reinterpret_cast<PyArrayObject *>(object)));
-}
-
 template <class T>
 constexpr int TYPE = std::is_same_v<std::remove_const_t<T>, double>    ? NPY_DOUBLE
                      : std::is_same_v<std::remove_const_t<T>, int64_t> ? NPY_INT64
                                                                        : NPY_UINT64;
 
-// The text for stub files.
-constexpr auto NUMBERS = nb::detail::const_name("numpy.typing.NDArray[numpy.inexact]");
-constexpr auto FLOATS = nb::detail::const_name("numpy.typing.NDArray[numpy.float64]");
-constexpr auto INTEGERS = nb::detail::const_name("numpy.typing.NDArray[numpy.int64]");
-constexpr auto UNSIGNED = nb::detail::const_name("numpy.typing.NDArray[numpy.uint64]");
+// The memory of an array of this type and shape, to which it must be possible to write unless it is only `read`. The array has to
+// live as long as its memory is used.
+void *memory_of(nb::handle object, const char *name, int type, std::span<const npy_intp> shape, bool read);
 
-// An argument of a function in Python: an array of T with the given number of axes, which is written to unless T is
-// const. If `STATES` is true and T is double, the array has the type of a state, float64 or complex128; complex numbers
-// are pairs of floats here.
-template <class T, int AXES, bool STATES = false>
-struct ArrayOf {
-    static constexpr auto ARGUMENT = nb::detail::const_name<STATES>(
-        NUMBERS, nb::detail::const_name<TYPE<T> == NPY_DOUBLE>(
-                     FLOATS, nb::detail::const_name<TYPE<T> == NPY_INT64>(INTEGERS, UNSIGNED)));
-    T *data;
-    const npy_intp *shape;
-    int type;
-    PyObject *object;
-
-    bool take(PyObject *given) {
-        type = STATES && is_plain(given, NPY_CDOUBLE, AXES) ? static_cast<int>(NPY_CDOUBLE) : TYPE<T>;
-        if (!is_plain(given, type, AXES)) return false;
-        object = given;
-        auto *array = reinterpret_cast<PyArrayObject *>(given);
-        data = static_cast<T *>(PyArray_DATA(array));
-        shape = PyArray_DIMS(array);
-        return std::is_const_v<T> || PyArray_ISWRITEABLE(array);
-    }
-};
-
-template <class T, int AXES>
-using StatesOf = ArrayOf<T, AXES, true>;
-
-// An array argument with any number of axes. Its numbers are floats or, if PAIRS, complex numbers or an even number of
-// floats. `columns` is the length of its last axis.
-template <class T, bool PAIRS>
-struct PointsOf {
-    static constexpr auto ARGUMENT = nb::detail::const_name<PAIRS>(NUMBERS, FLOATS);
-    T *data;
-    npy_intp points, columns;
-
-    operator PointsOf<const T, PAIRS>() const { return {data, points, columns}; }
-
-    bool take(PyObject *object) {
-        auto *array = reinterpret_cast<PyArrayObject *>(object);
-        if (!PyArray_Check(object) || PyArray_NDIM(array) == 0 || !PyArray_ISCARRAY_RO(array)) return false;
-        points = PyArray_SIZE(array);
-        columns = PyArray_DIM(array, PyArray_NDIM(array) - 1);
-        const int type = PyArray_TYPE(array);
-        const bool split = PAIRS && type == NPY_DOUBLE && columns % 2 == 0;
-        if (split) {
-            points /= 2;
-            columns /= 2;
-        }
-        data = static_cast<T *>(PyArray_DATA(array));
-        return (split || type == (PAIRS ? NPY_CDOUBLE : NPY_DOUBLE)) &&
-               (std::is_const_v<T> || PyArray_ISWRITEABLE(array));
-    }
-};
-
-using Field = PointsOf<double, true>;
-using ConstField = PointsOf<const double, true>;
-using ConstReals = PointsOf<const double, false>;
-
-template <class First, class... Others>
-void require_one_length(const First &first, const Others &...others) {
-    require(((first.points == others.points) && ...), "expected arrays with the same number of points");
+// The same, given the lengths of the axes; a `Bound` length becomes that of the array. Memory of `const T` is only read.
+template <class T, class... Axes>
+T *memory(nb::handle object, const char *name, int type, Axes... axes) {
+    int axis = 0;
+    const auto length = [&]<class Axis>(Axis given) -> npy_intp {
+        const int at = axis++;
+        if constexpr (!std::is_same_v<Axis, Bound>)
+            return given;
+        else if (!is_plain(object.ptr(), type, sizeof...(Axes)))
+            return given.length = -1;
+        else
+            return given.length = PyArray_DIM(reinterpret_cast<PyArrayObject *>(object.ptr()), at);
+    };
+    const npy_intp shape[] = {length(axes)...};
+    return static_cast<T *>(memory_of(object, name, type, shape, std::is_const_v<T>));
 }
 
 // The end of the process: which thread ends it. A daemon thread that then asks for the lock of Python is ended on the spot,
@@ -220,27 +169,4 @@ class [[maybe_unused]] WithoutLock {
     PyThreadState *state_ = PyEval_SaveThread();
 };
 
-// Lets other threads run while a large array is worked on.
-class [[maybe_unused]] Released {
-  public:
-    explicit Released(npy_intp points) {
-        if (points >= LARGE) released_.emplace();
-    }
-
-  private:
-    static constexpr npy_intp LARGE = 1 << 14;
-    std::optional<WithoutLock> released_;
-};
-
 }  // namespace eip
-
-namespace nanobind::detail {
-
-// NumPy's own interface is used, which costs 1 ns an argument; nb::ndarray takes 115.
-template <class Argument>
-struct type_caster<Argument, enable_if_t<(sizeof(Argument::ARGUMENT) > 0)>> {
-    NB_TYPE_CASTER(Argument, Argument::ARGUMENT)
-    bool from_python(handle object, uint32_t, cleanup_list *) noexcept { return value.take(object.ptr()); }
-};
-
-}  // namespace nanobind::detail

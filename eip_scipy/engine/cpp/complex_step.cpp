@@ -1,8 +1,6 @@
 // Gradients of functions in Python by complex steps: Im I(y + i h e_k) / h, which loses no digit to a difference.
 #include "module.hpp"
 
-#include <nanobind/stl/optional.h>
-
 #include <cmath>
 #include <vector>
 
@@ -14,7 +12,7 @@ namespace {
 // a singularity; and how far they may differ: in units of the sum of the derivative's terms, and in roundings of the
 // values.
 constexpr double ONE_SIDED = 1e-8, TWO_SIDED[] = {1e-5, 1e-7};
-constexpr double AGREEMENT = 1e-6, ROUNDINGS = 8.0, EPS = 2.220446049250313e-16;
+constexpr double AGREEMENT = 1e-6, ROUNDINGS = 8.0;
 
 // y with a small imaginary part in component k: a new array each time, since the function may keep what it was given.
 Array shifted(const double *y, npy_intp n, npy_intp k, double step) {
@@ -86,27 +84,9 @@ class Columns {
     double *out_ = nullptr;
 };
 
-// A function in Python of t, the state and further arguments.
-class Function {
-  public:
-    Function(nb::handle fun, nb::handle t, const nb::tuple &args) : fun_(fun), arguments_(3 + nb::len(args)) {
-        arguments_[1] = t.ptr();  // after the place that a vectorcall may write to
-        for (size_t k = 0; k < nb::len(args); ++k) arguments_[3 + k] = args[k].ptr();
-    }
-
-    nb::object operator()(const Array &state) {
-        arguments_[2] = state.ptr();
-        const size_t count = (arguments_.size() - 1) | PY_VECTORCALL_ARGUMENTS_OFFSET;
-        return owned(PyObject_Vectorcall(fun_.ptr(), arguments_.data() + 1, count, nullptr));
-    }
-
-  private:
-    nb::handle fun_;
-    std::vector<PyObject *> arguments_;
-};
-
 // The function's values at y + step * way, (l,).
-std::vector<double> values_at(Function &function, const double *y, const std::vector<double> &way, double step) {
+template <class Function>
+std::vector<double> values_at(const Function &function, const double *y, const std::vector<double> &way, double step) {
     const Array state = new_array({static_cast<npy_intp>(way.size())});
     for (size_t k = 0; k < way.size(); ++k) state.floats()[k] = y[k] + step * way[k];
     const Array found = owned<Array>(PyArray_FROM_OTF(function(state).ptr(), NPY_DOUBLE, NPY_ARRAY_IN_ARRAY));
@@ -130,7 +110,8 @@ bool is_slope(const Columns &columns, const std::vector<double> &way, const std:
 }
 
 // True if a gradient agrees with the function's differences along one direction, in units of |y_k| + floors_k.
-bool agrees(Function &function, const Columns &columns, const double *y, npy_intp n, const double *direction,
+template <class Function>
+bool agrees(const Function &function, const Columns &columns, const double *y, npy_intp n, const double *direction,
             const double *floors) {
     std::vector<double> way(n);
     for (npy_intp k = 0; k < n; ++k) way[k] = direction[k] * (std::abs(y[k]) + floors[k]);
@@ -142,29 +123,36 @@ bool agrees(Function &function, const Columns &columns, const double *y, npy_int
     return false;
 }
 
-using State = ArrayOf<const double, 1>;
-
-Columns columns_of(Function &function, const State &y, double step) {
-    const npy_intp n = y.shape[0];
+// The state of these floats.
+std::span<const double> state_of(nb::handle y) {
+    int64_t n = 0;
+    const double *floats = memory<const double>(y, "y", NPY_DOUBLE, Bound{n});
     require(n > 0, "complex_step: expected a state of one number or more");
+    return {floats, static_cast<size_t>(n)};
+}
+
+template <class Function>
+Columns columns_of(const Function &function, std::span<const double> y, double step) {
+    const auto n = std::ssize(y);
     Columns columns(n, step);
-    for (npy_intp k = 0; k < n; ++k) columns.take(function(shifted(y.data, n, k, step)).ptr(), k);
+    for (npy_intp k = 0; k < n; ++k) columns.take(function(shifted(y.data(), n, k, step)).ptr(), k);
     return columns;
 }
 
-Array complex_step(nb::handle fun, nb::handle t, State y, const nb::tuple &args, double step) {
-    Function function(fun, t, args);
-    return columns_of(function, y, step).gradient();
+Array complex_step(nb::handle fun, nb::handle t, nb::handle y, const nb::tuple &args, double step) {
+    const auto function = [&](const Array &state) { return nb::object(fun(t, state, *args)); };
+    return columns_of(function, state_of(y), step).gradient();
 }
 
-std::optional<Array> checked_complex_step(nb::handle fun, nb::handle t, State y, const nb::tuple &args, double step,
-                                          State direction, State floors) {
-    const npy_intp n = y.shape[0];
-    require(direction.shape[0] == n && floors.shape[0] == n,
-            "checked_complex_step: expected y, direction and floors of one length");
-    Function function(fun, t, args);
-    const Columns columns = columns_of(function, y, step);
-    if (!agrees(function, columns, y.data, n, direction.data, floors.data)) return {};
+nb::object checked_complex_step(nb::handle fun, nb::handle t, nb::handle y, const nb::tuple &args, double step,
+                                nb::handle direction, nb::handle floors) {
+    const std::span<const double> state = state_of(y);
+    const auto n = std::ssize(state);
+    const double *way = memory<const double>(direction, "direction", NPY_DOUBLE, n);
+    const double *least = memory<const double>(floors, "floors", NPY_DOUBLE, n);
+    const auto function = [&](const Array &state) { return nb::object(fun(t, state, *args)); };
+    const Columns columns = columns_of(function, state, step);
+    if (!agrees(function, columns, state.data(), n, way, least)) return nb::none();
     return columns.gradient();
 }
 
@@ -172,12 +160,13 @@ std::optional<Array> checked_complex_step(nb::handle fun, nb::handle t, State y,
 
 void add_gradients(Module module) {
     module.def("complex_step", complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a,
-               "Return the derivatives (..., n) of ``fun(t, y, *args)`` with respect to the components of `y` (n,), by "
-               "complex steps of length `step`.");
-    module.def("checked_complex_step", checked_complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a, "direction"_a,
-               "floors"_a,
-               "Return the value of `complex_step`, or None if it disagrees with differences of ``fun`` along "
-               "``direction * (abs(y) + floors)``, as it does if ``fun`` is not analytic.");
+               "Return the derivatives (..., n) of ``fun(t, y, *args)`` by `y` (n,), by complex steps of this length.");
+    module.def(
+        "checked_complex_step", checked_complex_step, "fun"_a, "t"_a, "y"_a, "args"_a, "step"_a, "direction"_a,
+        "floors"_a,
+        nb::sig("def checked_complex_step(fun: object, t: object, y: object, args: tuple, step: float, "
+                "direction: object, floors: object) -> numpy.ndarray | None"),
+        "Return `complex_step`, or None if differences along ``direction * (abs(y) + floors)`` disagree with it.");
 }
 
 }  // namespace eip

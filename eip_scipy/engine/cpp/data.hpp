@@ -4,7 +4,6 @@
 #pragma once
 
 #include <cstdint>
-#include <initializer_list>
 #include <limits>
 
 namespace eip {
@@ -69,37 +68,113 @@ constexpr double EPS = 2.220446049250313e-16;
 constexpr double ENDLESS = std::numeric_limits<double>::infinity();
 constexpr double NOT_A_NUMBER = std::numeric_limits<double>::quiet_NaN();
 
-// The records below come from Python, where they are named tuples. `fields` lists a record's fields once, in their order:
-// `visit` gets each one's name, its place here and, of an array, the lengths of its axes. A length that is `Bound` is that of
-// the array; all others must fit. `visit.sizes` are those of the run; what is derived from the fields is set at the end.
-// records.cpp makes the named tuples by these functions, and reads them.
+constexpr int64_t MEMORIES = 3;  // of the metric, see `MetricMemory`
+
+// The records below come from Python, where they are named tuples. A list names the fields of a record once, in their order there:
+// FIELD(type, name) or, of an array, FIELD(type, name, lengths of its axes...); STATES in the place of FIELD for
+// arrays of the type of a state; PYTHON(name, type, whether it may be left out) for what is read elsewhere; DERIVED(name, value) for a number that Python does not have.
+// A length that is `Bound` is that of the array, all others must fit; `run` has the sizes of the run. EIP_RECORD declares the
+// fields, and a function `fields` that visits them, by which records.cpp makes the named tuple and reads it.
 struct Bound {
     int64_t &length;
 };
 
 struct Sizes {
-    int64_t n = 0, m = 0, l = 0, blocks = 0, events = 0, params = 0, rows = 0;
-    bool tableau = true;  // whether a method has one
+    int64_t n = 0, m = 0, l = 0, blocks = 0, events = 0, params = 0;
 };
 
-// Visits several fields of the same kind, each given as its name and its place. For arrays the lengths of their axes
-// come first.
-template <class Visit, class Place, class... Others>
-void each(Visit &visit, const char *name, Place &place, Others &&...others) {
-    visit(name, place);
-    if constexpr (sizeof...(others) > 0) each(visit, others...);
-}
-template <class Visit, class Place, class... Others>
-void each(Visit &visit, std::initializer_list<int64_t> shape, const char *name, Place &place, Others &&...others) {
-    visit(name, place, shape);
-    if constexpr (sizeof...(others) > 0) each(visit, shape, others...);
-}
+#define EIP_DECLARE(TYPE, NAME, ...) TYPE NAME;
+#define EIP_DECLARE_DERIVED(NAME, ...) int64_t NAME;
+#define EIP_DECLARE_NOTHING(...)
+#define EIP_VISIT(TYPE, NAME, ...) visit(#NAME, NAME __VA_OPT__(, ) __VA_ARGS__);
+#define EIP_VISIT_STATES(TYPE, NAME, ...) visit.states(#NAME, NAME, __VA_ARGS__);
+#define EIP_VISIT_PYTHON(NAME, ...) visit.in_python(#NAME, __VA_ARGS__);
+#define EIP_VISIT_DERIVED(NAME, VALUE) NAME = VALUE;
+#define EIP_RECORD(LIST, TEXT)                                                 \
+    static constexpr const char *RECORD = TEXT;                                \
+    LIST(EIP_DECLARE, EIP_DECLARE, EIP_DECLARE_NOTHING, EIP_DECLARE_DERIVED)   \
+    template <class Visit>                                                     \
+    void fields(Visit &visit) {                                                \
+        [[maybe_unused]] const Sizes &run = visit.sizes;                       \
+        LIST(EIP_VISIT, EIP_VISIT_STATES, EIP_VISIT_PYTHON, EIP_VISIT_DERIVED) \
+    }
+
+// clang-format off
+#define EIP_SPAN(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(double, t0) FIELD(double, h) FIELD(double, t_bound) FIELD(double, sign) FIELD(int64_t, n_steps) \
+    FIELD(double, max_step)
+
+#define EIP_MULTISTEP(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const double *, predict_q, Bound{order}) FIELD(const double *, predict_v, order) \
+    FIELD(const double *, states_q, order, order) FIELD(const double *, states_v, order, order) \
+    FIELD(const double *, correction, order + 1) FIELD(const double *, shape_q, order + 1) \
+    FIELD(const double *, shape_v, order + 1) FIELD(const double *, size, order + 1) \
+    FIELD(double, error_constant) FIELD(double, growth) FIELD(int64_t, middle) FIELD(bool, brief) FIELD(bool, level) \
+    FIELD(bool, uses_v) FIELD(double, t0) FIELD(double, h) FIELD(int64_t, substeps) FIELD(int64_t, spacing) \
+    FIELD(int64_t, corrected_first) FIELD(int64_t, corrected_count) FIELD(double *, nodes, Bound{rows}, Bound{pitch}) \
+    FIELD(double *, sums, 4, pitch) FIELD(double *, predicted, 3, pitch) FIELD(double *, change, run.m / 2) \
+    FIELD(double *, levels, 3, run.l) FIELD(double *, rates, rows, Bound{balances}) \
+    FIELD(double *, rate_sums, 2, balances) FIELD(int64_t *, place, N_NODE_PLACES) DERIVED(half, run.m / 2)
+
+#define EIP_METHOD(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const double *, b, Bound{stages}) FIELD(const double *, c, stages) FIELD(double, exponent) \
+    FIELD(const double *, A, stages, Bound{columns}) FIELD(const double *, b_low, stages) \
+    FIELD(const double *, b_v, stages) FIELD(const double *, b_v_low, stages) FIELD(const double *, e, Bound{n_e}) \
+    FIELD(const double *, e_v, Bound{n_e_v}) FIELD(const double *, e_low, Bound{n_e_low}) FIELD(bool, nystrom) \
+    FIELD(bool, fsal) FIELD(bool, paired) FIELD(bool, sees_velocity) PYTHON(multistep, "Multistep | None", true)
+
+#define EIP_BLOCKS(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const uint64_t *, member, Bound{members}) FIELD(const uint64_t *, start, Bound{starts}) \
+    FIELD(int64_t, width) FIELD(int64_t, size) DERIVED(count, starts - 1)
+
+#define EIP_FRAME(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const uint64_t *, start, 2, Bound{starts}) FIELD(const uint64_t *, place, Bound{values}) \
+    FIELD(const double *, value, values) DERIVED(rows, starts - 1) FIELD(double *, products, rows) \
+    FIELD(const double *, bodies, 2, Bound{groups}, Bound{count})
+
+#define EIP_BALANCES(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const int64_t *, place, Bound{count}) FIELD(const int64_t *, rated, Bound{stages})
+
+#define EIP_GROUPS(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const int64_t *, value, Bound{values}) FIELD(const int64_t *, first_value, Bound{ends}) \
+    FIELD(const int64_t *, first_direction, ends) FIELD(const int64_t *, first_float, Bound{float_ends}) \
+    FIELD(const int64_t *, place, Bound{floats}) FIELD(const double *, weight, floats) FIELD(int64_t, size) \
+    DERIVED(count, ends - 1) DERIVED(directions, float_ends - 1)
+
+#define EIP_COLUMNS(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(double *, kept, run.l, Bound{count}) FIELD(int64_t, size) FIELD(int64_t, seen) FIELD(int64_t, half) \
+    FIELD(bool, symplectic)
+
+#define EIP_OPTIONS(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(const double *, rtol, run.m) FIELD(const double *, atol, run.n) FIELD(const double *, block_atol, run.blocks) \
+    FIELD(Blocks, blocks) FIELD(Frame, frame) FIELD(Balances, balances) FIELD(Groups, balance_groups) \
+    FIELD(Columns, columns) FIELD(double *, target, run.l) FIELD(const double *, scales, run.l) \
+    FIELD(const double *, computed, run.l) FIELD(const double *, most_left, run.l) FIELD(Blocks, kinds) \
+    FIELD(const double *, masses, run.l, Bound{pairs}) FIELD(double, kappa) FIELD(int64_t, metric) \
+    FIELD(int64_t, direction) FIELD(int64_t, iterations) FIELD(int64_t, every) FIELD(bool, reuse_f) \
+    FIELD(bool, uses_f) FIELD(bool, compensated) FIELD(bool, adaptive) FIELD(double, per_band) FIELD(bool, watched) \
+    FIELD(double, limit) FIELD(double, distant) PYTHON(joint, "typing.Any", true)
+
+#define EIP_WORK(FIELD, STATES, PYTHON, DERIVED) \
+    STATES(V *, K, stages + 1, n) STATES(V *, stage, n) STATES(V *, y_hat, n) STATES(V *, f_point, n) \
+    STATES(V *, G, l, n) FIELD(V *, err, m) FIELD(V *, err_low, m) FIELD(V *, err_sum, m) FIELD(V *, sigma, m) FIELD(V *, move, m) FIELD(V *, shift, m) \
+    FIELD(V *, unit, m) FIELD(V *, carry, m) FIELD(V *, carry_hat, m) FIELD(V *, scale, run.blocks) \
+    FIELD(V *, inverse, run.blocks) FIELD(V *, ratio, run.blocks) FIELD(V *, remembered, run.blocks) \
+    FIELD(V *, memory, MEMORIES, run.blocks) FIELD(V *, memory_new, MEMORIES, run.blocks) FIELD(V *, B, l, m) \
+    FIELD(V *, Q, l, m) FIELD(V *, R, l, l) FIELD(V *, inverse_norms, l) FIELD(V *, mu, l) FIELD(V *, values, l) \
+    FIELD(V *, g, l) FIELD(V *, band, l) FIELD(V *, before, l) FIELD(V *, worth, l) FIELD(V *, residual, l) \
+    FIELD(V *, max_residual, l) FIELD(V *, max_correction, 1) FIELD(double *, norm, 1) FIELD(V *, trust, l, N_FIGURES) \
+    FIELD(V *, flow, l) FIELD(V *, rates, stages + 1, balances) FIELD(V *, level, balances) \
+    FIELD(V *, level_old, balances) FIELD(V *, level_carry, balances) FIELD(V *, level_carry_new, balances) \
+    FIELD(V *, slow, N_SLOW, balances) FIELD(double *, suspect, suspect_size()) FIELD(int64_t *, pivots, l) \
+    FIELD(int64_t *, counters, N_COUNTERS) FIELD(double *, inner_matrix, l, l) FIELD(double *, inner_R, l, l) \
+    FIELD(double *, inner_g, l) FIELD(double *, inner_inverse_norms, l) FIELD(double *, inner_mu, l) \
+    FIELD(int64_t *, inner_pivots, l)
+// clang-format on
 
 // Times of the steps of a run: t_k = t0 + k h (h = 0: adaptive steps), the last one on t_bound.
 struct Span {
-    double t0, h, t_bound, sign;
-    int64_t n_steps;
-    double max_step;
+    EIP_RECORD(EIP_SPAN, "Span")
 
     // The length that is left after k fixed steps. The difference of two times far from 0 has lost its last digits.
     double left(int64_t k) const { return (t_bound - t0) - static_cast<double>(k) * h; }
@@ -109,165 +184,63 @@ struct Span {
     }
 };
 
-template <class Visit>
-void fields(Span &s, Visit &visit) {
-    each(visit, "t0", s.t0, "h", s.h, "t_bound", s.t_bound, "sign", s.sign, "n_steps", s.n_steps, "max_step",
-         s.max_step);
-}
-
 // Data of a multistep method in addition to the state (multistep.hpp); weights go from the oldest node to the newest.
+//
+// Numbers of an acceleration, of a row for it, and rows. The shapes and the size are those of differences that tell the errors. `brief`:
+// there is no history at all; `level`: states are not `middle` nodes behind it; `uses_v`: accelerations take velocities. `substeps`
+// of the method that starts; `spacing`: nodes from one projection to the next. The Jacobian corrects `corrected_count` components.
 struct Multistep {
-    int64_t order, middle, half, pitch, rows;  // numbers of an acceleration, of a row for it, and rows
-    const double *predict_q, *predict_v;       // (order)
-    const double *states_q, *states_v;         // (order, order): of the state at a number of nodes before the newest
-    const double *correction;                  // (order + 1)
-    const double *shape_q, *shape_v, *size;    // (order + 1): differences that tell the errors' shape, and their size
-    double error_constant, growth;
-    bool brief, level, uses_v;  // no history at all; states not `middle` nodes behind it; accelerations take velocities
-    double t0, h;
-    int64_t substeps, spacing;            // of the method that starts; nodes from one projection to the next
-    int64_t first, count;                 // components that the Jacobian corrects
-    double *nodes, *sums;                 // (rows, pitch), (4, pitch)
-    double *predicted, *change, *levels;  // (3, pitch), (half), (3, l)
-    double *rates, *rate_sums;            // of the balances: (rows, balances), (2, balances)
-    int64_t balances;
-    int64_t *place;
+    int64_t order, pitch, rows, balances;
+    EIP_RECORD(EIP_MULTISTEP, "Multistep")
 
     double *rates_at(int64_t row) const { return rates + row * balances; }
 };
 
-template <class Visit>
-void fields(Multistep &ms, Visit &visit) {
-    visit("predict_q", ms.predict_q, Bound{ms.order});
-    visit("predict_v", ms.predict_v, ms.order);
-    visit("states_q", ms.states_q, ms.order, ms.order);
-    visit("states_v", ms.states_v, ms.order, ms.order);
-    visit("correction", ms.correction, ms.order + 1);
-    visit("shape_q", ms.shape_q, ms.order + 1);
-    visit("shape_v", ms.shape_v, ms.order + 1);
-    visit("size", ms.size, ms.order + 1);
-    each(visit, "error_constant", ms.error_constant, "growth", ms.growth, "middle", ms.middle, "brief", ms.brief,
-         "level", ms.level, "uses_v", ms.uses_v, "t0", ms.t0, "h", ms.h, "substeps", ms.substeps, "spacing", ms.spacing,
-         "corrected_first", ms.first, "corrected_count", ms.count);
-    visit("nodes", ms.nodes, Bound{ms.rows}, Bound{ms.pitch});
-    visit("sums", ms.sums, 4, ms.pitch);
-    visit("predicted", ms.predicted, 3, ms.pitch);
-    visit("change", ms.change, visit.sizes.m / 2);
-    visit("levels", ms.levels, 3, visit.sizes.l);
-    visit("rates", ms.rates, ms.rows, Bound{ms.balances});
-    visit("rate_sums", ms.rate_sums, 2, ms.balances);
-    visit("place", ms.place, N_NODE_PLACES);
-    ms.half = visit.sizes.m / 2;
-}
-
 // A tableau; rows of A are `columns` long. e weighs the rows of K in the error estimate, e_low in DOP853's second one;
-// names ending in _v are a Nystrom method's weights of the velocity.
+// names ending in _v are a Nystrom method's weights of the velocity. `sees_velocity`: whether the accelerations of a Nystrom method
+// come from a function that takes velocities too. `multistep` is null unless the tableau makes the first states of such a method.
+// A one-step method of a user's own has an empty tableau.
 struct Method {
-    int64_t stages, columns;
-    const double *A, *b, *b_low, *b_v, *b_v_low, *c, *e, *e_v, *e_low;
-    int64_t n_e, n_e_v, n_e_low;
-    bool nystrom, fsal, paired;
-    bool sees_velocity;  // whether the accelerations of a Nystrom method come from a function that takes velocities too
-    double exponent;
-    const Multistep *multistep;  // whose first states the tableau makes, else null
+    int64_t stages, columns, n_e, n_e_v, n_e_low;
+    EIP_RECORD(EIP_METHOD, "Method")
+    const Multistep *multistep;
 };
-
-// A one-step method of a user's own has no tableau.
-template <class Visit>
-void fields(Method &m, Visit &visit) {
-    visit("b", m.b, Bound{m.stages});
-    visit("c", m.c, m.stages);
-    visit("exponent", m.exponent);
-    if (!visit.sizes.tableau) return;
-    visit("A", m.A, m.stages, Bound{m.columns});
-    visit("b_low", m.b_low, m.stages);
-    visit("b_v", m.b_v, m.stages);
-    visit("b_v_low", m.b_v_low, m.stages);
-    visit("e", m.e, Bound{m.n_e});
-    visit("e_v", m.e_v, Bound{m.n_e_v});
-    visit("e_low", m.e_low, Bound{m.n_e_low});
-    each(visit, "nystrom", m.nystrom, "fsal", m.fsal, "paired", m.paired, "sees_velocity", m.sees_velocity);
-    visit.in_python("multistep", "Multistep | None", true);
-}
 
 // Blocks of floats: block b contains the floats with the indices member[start[b]] to member[start[b + 1] - 1]. `size`
 // is the size of all blocks if they are consecutive and equally large, otherwise 0.
 struct Blocks {
-    const uint64_t *member, *start;
-    int64_t members, starts, count, width, size;
+    int64_t members, starts;
+    EIP_RECORD(EIP_BLOCKS, "Grouping")
 };
-
-template <class Visit>
-void fields(Blocks &b, Visit &visit) {
-    visit("member", b.member, Bound{b.members});
-    visit("start", b.start, Bound{b.starts});
-    each(visit, "width", b.width, "size", b.size);
-    b.count = b.starts - 1;
-}
 
 // Linear invariants that corrections must not change: the non-zeros of C and, after them, those of M^T, where M = S (C
-// S)^-1. If the x, y and z of bodies have equal rows, `bodies` (2, groups, count) holds their weights instead.
+// S)^-1. If the x, y and z of bodies have equal rows, `bodies` (2, groups, count) holds their weights instead. `products` is scratch.
 struct Frame {
-    const uint64_t *start, *place;
-    const double *value;
-    int64_t starts, rows, values;
-    double *products;  // scratch
-    const double *bodies;
-    int64_t groups, count;
+    int64_t starts, values, groups, count;
+    EIP_RECORD(EIP_FRAME, "FrameRows")
 };
-
-template <class Visit>
-void fields(Frame &f, Visit &visit) {
-    visit("start", f.start, 2, Bound{f.starts});
-    visit("place", f.place, Bound{f.values});
-    visit("value", f.value, f.values);
-    f.rows = f.starts - 1;
-    visit("products", f.products, f.rows);
-    visit("bodies", f.bodies, 2, Bound{f.groups}, Bound{f.count});
-}
 
 // Invariants whose targets change at known rates, by their places, and whether the step takes their rates at each stage.
 struct Balances {
-    const int64_t *place, *rated;
     int64_t count, stages;
+    EIP_RECORD(EIP_BALANCES, "Balances")
 };
-
-template <class Visit>
-void fields(Balances &b, Visit &visit) {
-    visit("place", b.place, Bound{b.count});
-    visit("rated", b.rated, Bound{b.stages});
-}
 
 // Groups of values of the invariants, each of which is projected separately: the indices of the values of a group, its
 // directions, and the floats that move along a direction, each with its weight. `size` is 3 if a float stands for x, y
 // and z of a body, each with a direction of its own; otherwise it is 1.
 struct Groups {
-    const int64_t *value, *first_value, *first_direction, *first_float, *place;
-    const double *weight;
-    int64_t values, count, ends, directions, floats, size;  // ends: count + 1
+    int64_t values, ends, float_ends, floats;
+    EIP_RECORD(EIP_GROUPS, "Groups")
 };
-
-template <class Visit>
-void fields(Groups &g, Visit &visit) {
-    visit("value", g.value, Bound{g.values});
-    visit("first_value", g.first_value, Bound{g.ends});
-    visit("first_direction", g.first_direction, g.ends);
-    g.count = g.ends - 1;
-    visit("first_float", g.first_float, Bound{g.directions});
-    visit("place", g.place, Bound{g.floats});
-    visit("weight", g.weight, g.floats);
-    visit("size", g.size);
-    --g.directions;
-}
 
 // Columns of derivatives behind a state of `size` floats, of as many each: solutions M of the variational equations. The
 // first `seen` floats of the state are the user's, behind which parameters may stand as constants. A Nystrom method, whose
 // states are positions and velocities, has the first `half` floats of all first, then the others. `kept`: G M of the
 // invariants' gradients G, which is constant. symplectic: M^T J M = J is restored as well.
 struct Columns {
-    double *kept;  // (l, count)
-    int64_t count, size, seen, half;
-    bool symplectic;
+    int64_t count;
+    EIP_RECORD(EIP_COLUMNS, "Columns")
 
     // The places of the first and of the second part of column c, -1 for the state, and the length of the first part.
     int64_t cut() const { return half > 0 ? half : size; }
@@ -277,58 +250,16 @@ struct Columns {
     int64_t wide() const { return (1 + count) * size; }
 };
 
-template <class Visit>
-void fields(Columns &c, Visit &visit) {
-    visit("kept", c.kept, visit.sizes.l, Bound{c.count});
-    each(visit, "size", c.size, "seen", c.seen, "half", c.half, "symplectic", c.symplectic);
-}
-
+// Options of the steps and of their projections. Tolerances by float, by component and by block; `computed` is 1 for invariants
+// without a gradient of the user's; `most_left` is the share of its terms that a Newton step may leave without a further one, and
+// `has_limits` says whether any of these is finite; `kinds` are the floats of the same unit, as far as that is known; `masses` is
+// explained at `FromF` in system.hpp, `pairs` is 0 in runs without such gradients. An invariant's terms are `per_band` dead bands;
+// `limit` is the share of the terms that may be left, and `distant` that from which on residuals before a projection are noted.
 struct Options {
-    const double *rtol, *atol, *block_atol;  // by float, by component, by block
-    Blocks blocks;
-    Frame frame;
-    Balances balances;
-    Groups balance_groups;
-    Columns columns;
-    double *target;
-    const double *scales, *computed;  // computed: 1 for invariants without a gradient of the user's
-    const double *most_left;          // the share of its terms that a Newton step may leave without a further one
-    bool has_limits;                  // whether any of these is finite
-    Blocks kinds;                     // floats of the same unit, as far as that is known
-    const double *masses;             // (l, pairs), see `FromF` in system.hpp; pairs = 0 in runs without such gradients
     int64_t pairs;
-    double kappa;
-    int64_t metric, direction, iterations, every;
-    bool reuse_f, uses_f, compensated, adaptive, watched;
-    double per_band;  // an invariant's terms are this many dead bands
-    double limit;     // the share of the terms that may be left
-    double distant;   // residuals before a projection are noted from this share of the terms on
+    bool has_limits;
+    EIP_RECORD(EIP_OPTIONS, "Options")
 };
-
-template <class Visit>
-void fields(Options &o, Visit &visit) {
-    const Sizes &is = visit.sizes;
-    visit("rtol", o.rtol, is.m);
-    visit("atol", o.atol, is.n);
-    visit("block_atol", o.block_atol, is.blocks);
-    visit.record("groups", "Grouping", o.blocks);
-    visit.record("frame", "FrameRows", o.frame);
-    visit.record("balances", "Balances", o.balances);
-    visit.record("balance_groups", "Groups", o.balance_groups);
-    visit.record("columns", "Columns", o.columns);
-    visit("target", o.target, is.l);
-    visit("scales", o.scales, is.l);
-    visit("computed", o.computed, is.l);
-    visit("most_left", o.most_left, is.l);
-    visit.record("kinds", "Grouping", o.kinds);
-    visit("masses", o.masses, is.l, Bound{o.pairs});
-    each(visit, "kappa", o.kappa, "metric", o.metric, "direction", o.direction, "iterations", o.iterations, "every",
-         o.every, "reuse_f", o.reuse_f, "uses_f", o.uses_f, "compensated", o.compensated, "adaptive", o.adaptive,
-         "per_band", o.per_band, "watched", o.watched, "limit", o.limit, "distant", o.distant);
-    visit.in_python("joint", "typing.Any", true);
-}
-
-constexpr int64_t MEMORIES = 3;  // of the metric, see `MetricMemory`
 
 // Buffers of a run of m values (floats, or those of eight members), l invariants, some of which are balances, and
 // `stages` + 1 rows of K. For each balance: rows of rates at the stages, its value at the current state and what rounding
@@ -341,15 +272,8 @@ struct WorkOf {
     using Method = eip::Method;
     using Options = eip::Options;
     int64_t n, m, l, stages, balances;
-    Value *K, *stage, *y_hat, *f_point, *G, *err, *err_low, *err_sum, *sigma, *scale, *inverse, *ratio, *remembered,
-        *memory, *memory_new, *move, *shift, *unit, *carry, *carry_hat, *B, *Q, *R, *inverse_norms, *mu, *values, *g,
-        *band, *before, *worth, *residual, *max_residual, *max_correction, *trust, *flow, *rates, *level, *level_old,
-        *level_carry, *level_carry_new, *slow, *target,
-        *products;  // the last two: the invariants' targets; scratch of the frame
-    double *norm, *suspect;
-    int64_t *pivots, *counters;
-    double *inner_matrix, *inner_g, *inner_inverse_norms, *inner_R, *inner_mu;  // scratch of the small Newton systems
-    int64_t *inner_pivots;
+    V *target, *products;  // the invariants' targets; scratch of the frame
+    EIP_RECORD(EIP_WORK, "Work")
     int64_t behind = 0;  // of a part of a state: floats of the whole one that are behind its m
 
     int64_t whole() const { return m + behind; }
@@ -361,39 +285,6 @@ struct WorkOf {
     Value *rate(int64_t i) const { return rates + i * balances; }  // of the balances at stage i
     Value *figures(int64_t i) const { return trust + i * N_FIGURES; }
 };
-
-// Visits all buffers of a run, by name and shape, for code that creates the buffers or passes them on. Buffers with the
-// type of a state hold w.n of its numbers in each row.
-template <class V, class Visit>
-void each_buffer(WorkOf<V> &w, int64_t blocks, Visit &visit) {
-    const int64_t n = w.n, l = w.l, m = w.m;
-    visit.states("K", w.K, {w.stages + 1, n});
-    visit.states("stage", w.stage, {n});
-    visit.states("y_hat", w.y_hat, {n});
-    visit.states("f_point", w.f_point, {n});
-    visit.states("G", w.G, {l, n});
-    each(visit, {m}, "err", w.err, "err_low", w.err_low, "err_sum", w.err_sum, "sigma", w.sigma, "move", w.move,
-         "shift", w.shift, "unit", w.unit, "carry", w.carry, "carry_hat", w.carry_hat);
-    each(visit, {blocks}, "scale", w.scale, "inverse", w.inverse, "ratio", w.ratio, "remembered", w.remembered);
-    each(visit, {MEMORIES, blocks}, "memory", w.memory, "memory_new", w.memory_new);
-    each(visit, {l, m}, "B", w.B, "Q", w.Q);
-    visit("R", w.R, {l, l});
-    each(visit, {l}, "inverse_norms", w.inverse_norms, "mu", w.mu, "values", w.values, "g", w.g, "band", w.band,
-         "before", w.before, "worth", w.worth, "residual", w.residual, "max_residual", w.max_residual);
-    each(visit, {1}, "max_correction", w.max_correction, "norm", w.norm);
-    visit("trust", w.trust, {l, N_FIGURES});
-    visit("flow", w.flow, {l});
-    visit("rates", w.rates, {w.stages + 1, w.balances});
-    each(visit, {w.balances}, "level", w.level, "level_old", w.level_old, "level_carry", w.level_carry,
-         "level_carry_new", w.level_carry_new);
-    visit("slow", w.slow, {N_SLOW, w.balances});
-    visit("suspect", w.suspect, {w.suspect_size()});
-    visit("pivots", w.pivots, {l});
-    visit("counters", w.counters, {N_COUNTERS});
-    each(visit, {l, l}, "inner_matrix", w.inner_matrix, "inner_R", w.inner_R);
-    each(visit, {l}, "inner_g", w.inner_g, "inner_inverse_norms", w.inner_inverse_norms, "inner_mu", w.inner_mu,
-         "inner_pivots", w.inner_pivots);
-}
 
 using Work = WorkOf<double>;
 

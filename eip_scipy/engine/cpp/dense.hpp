@@ -19,17 +19,25 @@ constexpr double SMALL_SHARE = 1e-9;
 // Inputs of the interpolants of a run, and the buffers of their projections. `weights` are rows over the stages:
 // those of a tableau's own polynomial, or of that of DOP853 or a Nystrom method, which have `further` stages, or Lagrange's
 // for the nodes of a multistep method, [interval, node, power].
+//
+// `own_slopes`: the steps leave no f at their ends. `by_travel`: weights of the projection by what each block travels within the
+// step, else those of the run. `shows`: states that a step leaves unprojected are handed out as projected copies. `missed`: how many
+// states were left unprojected, and the time of the first. `waiting`: whether the states at the start and at the end of the current
+// step are not projected. `piece` is scratch for the interpolant of a step.
+// clang-format off
+#define EIP_DENSE(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(int64_t, kind) FIELD(const double *, weights, Bound{polynomials}, Bound{columns}) \
+    FIELD(const double *, c, Bound{further}) FIELD(const double *, A, further, Bound{A_columns}) \
+    FIELD(bool, own_slopes) FIELD(bool, by_travel) FIELD(bool, shows) PYTHON(options, "Options", false) \
+    PYTHON(work, "Work", false)     FIELD(double *, missed, 2) FIELD(int64_t *, waiting, 2) \
+    FIELD(double *, piece, floats())
+// clang-format on
 struct Dense {
-    int64_t kind, polynomials, columns, further, A_columns;
-    const double *weights, *A, *c;
-    bool own_slopes;  // the steps leave no f at their ends
-    bool by_travel;   // weights of the projection by what each block travels within the step, else those of the run
-    bool shows;       // states that a step leaves unprojected are handed out as projected copies
+    int64_t polynomials, columns, further, A_columns;
+    EIP_RECORD(EIP_DENSE, "Dense")
     Options options;
     Work work;
     const Multistep *multistep;
-    double *missed;    // how many states were left unprojected, and the time of the first
-    int64_t *waiting;  // whether the states at the start and at the end of the current step are not projected
 
     // States that make up an interpolant, in addition to those of the two ends and the weights.
     int64_t rows() const {

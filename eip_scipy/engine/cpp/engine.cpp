@@ -1,6 +1,6 @@
 #include "engine.hpp"
 
-#include "side_by_side.hpp"
+#include "batch_loop.hpp"
 
 namespace eip {
 namespace {

@@ -1,20 +1,20 @@
 // Functions of the engine that the binding calls. Their templates are compiled once, in engine.cpp.
 #pragma once
 
-#include "eight.hpp"
+#include "batch.hpp"
 #include "members.hpp"
 
 namespace eip {
 
-// The first two call `advance` (loop.hpp) and `sweep` (members.hpp), the third one is in side_by_side.hpp; comments there
+// The first two call `advance` (loop.hpp) and `sweep` (members.hpp), the third one is in batch_loop.hpp; comments there
 // explain the codes that are returned.
 Code advance_run(const Run &run, Samples *samples, const Schedule &s, int64_t k_end, double *y, double *y_new,
                  const Saved &saved);
 Code sweep_members(const Run &run, Samples *samples, const Schedule &s, const Members &members, int64_t steps,
                    double *y, double *y_new);
 
-Code sweep_octets(const Run &run, Eight &eight, Samples *samples, const Schedule &s, const Members &members,
-                  int64_t steps, double *y, double *y_new);
+Code sweep_batches(const Run &run, Batch &batch, Samples *samples, const Schedule &s, const Members &members,
+                   int64_t steps, double *y, double *y_new);
 
 // Step k of a run, and parts of a step: its projection, and what follows it.
 Code step_once(const Run &run, const Schedule &s, int64_t k, const double *y, double *y_new);

@@ -2,7 +2,6 @@
 // something, core/invariant_checks.py examines it in Python, and writes the messages.
 #include "module.hpp"
 
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <bit>
@@ -29,10 +28,8 @@ constexpr double SHORT = 1e-6, KINK = 1e-4, KEPT_AT_HALF = 0.6;
 // The rounding of a value, in units of its terms.
 constexpr double VALUE_ROUNDINGS = 4.0;
 
-using State = StatesOf<const double, 1>;
-using Rows = StatesOf<const double, 2>;
-using Numbers = ArrayOf<const double, 1>;
 using Buffer = std::vector<double>;
+using Interval = std::tuple<double, double>;
 
 // Detection of numbers of single precision that use more than half of its bits.
 class Single {
@@ -60,18 +57,18 @@ class InvariantFunctions {
                 "invariants: the gradients do not have l * n numbers for the l values of the invariants");
     }
 
-    Array values(double t, State y) {
+    Array values(double t, nb::handle y) {
         Array out = new_array({l_});
-        evaluate(t, checked(y), out.floats());
+        evaluate(t, state(y), out.floats());
         return out;
     }
 
-    Array gradients(double t, State y, State f) {
+    Array gradients(double t, nb::handle y, nb::handle f) {
         Array out = new_array({l_, n_}, type_);
-        const double *state = checked(y), *slope = checked(f);
+        const double *at = state(y), *slope = state(f);
         double *G = out.floats();
         for (const PythonCall &call : grad_) {
-            call(t, state, slope, G, out);
+            call(t, at, slope, G, out);
             G += call.floats();
         }
         return out;
@@ -79,66 +76,58 @@ class InvariantFunctions {
 
     // True if nothing is wrong with the values' precision, with the gradients G and with the invariance at a state. For a
     // run of no duration it is false, and for NaN too.
-    bool is_in_order(double t, State y, State f, Rows G, Numbers here, double tau, std::tuple<double, double> interval,
-                     Rows directions) {
-        const double *state = checked(y), *slope = checked(f), *gradients = checked_rows(G, l_), *values = known(here);
-        const double *ways = checked_rows(directions, 2);
-        return are_kept(slope, gradients) && are_fixed(t, state, values, tau, interval) &&
-               have_right_gradients(t, state, slope, gradients, values, tau, ways);
+    bool is_in_order(double t, nb::handle y, nb::handle f, nb::handle G, nb::handle here, double tau, Interval interval,
+                     nb::handle directions) {
+        const Point at(*this, t, y, f, G, here);
+        return are_kept(at) && are_fixed(at, tau, interval) && have_right_gradients(at, tau, rows(directions, 2));
     }
 
     // Calls `note_rates` and `is_in_order` for a state of a run. If f is empty or not finite, it only returns true.
-    bool look(ArrayOf<double, 2> figures, double t, State y, State f, Numbers target, Numbers scales, double tau,
-              std::tuple<double, double> interval, Rows directions) {
-        if (n_ == 0 || !all_finite(checked(f), m_)) return true;
-        const Array at_state = gradients(t, y, f), numbers = values(t, y);
-        Rows G;
-        Numbers here;
-        G.take(at_state.ptr());
-        here.take(numbers.ptr());
-        note_rates(figures, t, y, f, G, here, target, scales, std::nullopt);
+    bool look(nb::handle figures, double t, nb::handle y, nb::handle f, nb::handle target, nb::handle scales,
+              double tau, Interval interval, nb::handle directions) {
+        if (n_ == 0 || !all_finite(state(f), m_)) return true;
+        const Array G = gradients(t, y, f), here = values(t, y);
+        note_rates(figures, t, y, f, G, here, target, scales, nb::none());
         return is_in_order(t, y, f, G, here, tau, interval, directions);
     }
 
     // The rates of change along f by short differences to both sides; NaN where these differ at a kink. Rates that are
     // within the rounding of the values, which is larger than terms that nearly vanish, are 0.
-    Array rates_by_values(double t, State y, State f, Rows G, Numbers here, Numbers target, Numbers scales) {
-        const double *state = checked(y), *slope = checked(f), *gradients = checked_rows(G, l_), *values = known(here);
-        const double *targets = known(target), *least = known(scales);
+    Array rates_by_values(double t, nb::handle y, nb::handle f, nb::handle G, nb::handle here, nb::handle target,
+                          nb::handle scales) {
+        const Point at(*this, t, y, f, G, here);
+        const double *targets = numbers(target), *least = numbers(scales);
         Array out = new_array({l_});
         double *rates = out.floats();
         fill(rates, 0.0, l_);
-        const double moving = largest(slope), size = largest(state);
+        const double moving = largest(at.f), size = largest(at.y);
         if (!(0.0 < moving && moving < ENDLESS && 0.0 < size && size < ENDLESS)) return out;
         const double step = SHORT * size / moving;
-        const Slopes slopes = slopes_along(t, state, slope, values, step);
-        const Slopes half = slopes_along(t, state, slope, values, 0.5 * step);
+        const Slopes slopes = slopes_along(at, step), half = slopes_along(at, 0.5 * step);
         for (int64_t i = 0; i < l_; ++i) {
             const double jump = std::abs(slopes.forth[i] - slopes.back[i]);
             const double half_jump = std::abs(half.forth[i] - half.back[i]);
-            const double *row = gradients + i * m_;
+            const double *row = at.G + i * m_;
             rates[i] = 0.5 * (slopes.back[i] + slopes.forth[i]);
-            if (jump > KINK * terms(row, slope) && (half_jump > KEPT_AT_HALF * jump || std::abs(rates[i]) <= jump))
+            if (jump > KINK * terms(row, at.f) && (half_jump > KEPT_AT_HALF * jump || std::abs(rates[i]) <= jump))
                 rates[i] = NOT_A_NUMBER;
-            const double own =
-                std::max(std::max(std::abs(values[i]), std::abs(targets[i])), std::max(terms(row, state), least[i]));
+            const double own = std::max({std::abs(at.values[i]), std::abs(targets[i]), terms(row, at.y), least[i]});
             if (std::abs(rates[i]) <= VALUE_ROUNDINGS * EPS * own / step) rates[i] = 0.0;
         }
         return out;
     }
 
     // Raises the largest rates of change along f that figures hold, by gradients and by values. They are in units of the
-    // terms, without what the values change by anyway.
-    void note_rates(ArrayOf<double, 2> figures, double t, State y, State f, Rows G, Numbers here, Numbers target,
-                    Numbers scales, std::optional<Numbers> own) {
-        require(figures.shape[0] == l_ && figures.shape[1] == N_FIGURES,
-                "invariants: figures must have the shape (l, N_FIGURES)");
+    // terms, without what the values change by anyway: `own`, of balances, or None.
+    void note_rates(nb::handle figures, double t, nb::handle y, nb::handle f, nb::handle G, nb::handle here,
+                    nb::handle target, nb::handle scales, nb::handle own) {
+        double *noted = memory<double>(figures, "figures", NPY_DOUBLE, l_, N_FIGURES);
         const Array by_values = rates_by_values(t, y, f, G, here, target, scales);
-        for (int64_t i = 0; i < l_; ++i) {
-            const double *row = G.data + i * m_, expected = own ? known(*own)[i] : 0.0;
-            const double size = terms(row, f.data), unit = size > 0.0 ? size : 1.0;
-            double *noted = figures.data + i * N_FIGURES;
-            noted[RATE] = std::fmax(noted[RATE], std::abs(dot(row, f.data, m_) - expected) / unit);
+        const double *slope = state(f), *row = rows(G, l_), *changes = own.is_none() ? nullptr : numbers(own);
+        for (int64_t i = 0; i < l_; ++i, noted += N_FIGURES, row += m_) {
+            const double expected = changes ? changes[i] : 0.0, size = terms(row, slope),
+                         unit = size > 0.0 ? size : 1.0;
+            noted[RATE] = std::fmax(noted[RATE], std::abs(dot(row, slope, m_) - expected) / unit);
             noted[EXAMINED] = std::fmax(noted[EXAMINED], std::abs(by_values.floats()[i] - expected) / unit);
         }
     }
@@ -155,20 +144,26 @@ class InvariantFunctions {
         Buffer back, forth;
     };
 
-    const double *checked(const State &y) const {
-        require(kept_.is_valid() && y.type == type_ && y.shape[0] == n_,
-                "invariants: y has another dtype or size than the run");
-        return y.data;
+    const double *state(nb::handle y) const { return memory<const double>(y, "a state", type_, n_); }
+    const double *rows(nb::handle G, int64_t count) const {
+        return memory<const double>(G, "G or directions", type_, count, n_);
     }
-    const double *checked_rows(const Rows &rows, int64_t count) const {
-        require(rows.type == type_ && rows.shape[0] == count && rows.shape[1] == n_,
-                "invariants: G must have the shape (l, n), directions the shape (2, n), and both the dtype of the run");
-        return rows.data;
+    const double *numbers(nb::handle a) const {
+        return memory<const double>(a, "a number of each value", NPY_DOUBLE, l_);
     }
-    const double *known(const Numbers &numbers) const {
-        require(numbers.shape[0] == l_, "invariants: expected one number for each value of the invariants");
-        return numbers.data;
-    }
+
+    // A state with its derivative, and the gradients and values there.
+    struct Point {
+        double t;
+        const double *y, *f, *G, *values;
+
+        Point(const InvariantFunctions &all, double t, nb::handle y, nb::handle f, nb::handle G, nb::handle values)
+            : t(t),
+              y(all.state(y)),
+              f(all.state(f)),
+              G(all.rows(G, all.l_)),
+              values(all.numbers(values)) {}
+    };
 
     void evaluate(double t, const double *y, double *out) const {
         for (const PythonCall &call : inv_) {
@@ -201,28 +196,26 @@ class InvariantFunctions {
         return state;
     }
 
-    Slopes slopes_along(double t, const double *y, const double *f, const double *here, double step) const {
+    Slopes slopes_along(const Point &at, double step) const {
         Slopes found{Buffer(l_), Buffer(l_)};
-        evaluate(t, shifted(y, -step, f).data(), found.back.data());
-        evaluate(t, shifted(y, step, f).data(), found.forth.data());
+        evaluate(at.t, shifted(at.y, -step, at.f).data(), found.back.data());
+        evaluate(at.t, shifted(at.y, step, at.f).data(), found.forth.data());
         for (int64_t i = 0; i < l_; ++i) {
-            found.back[i] = (here[i] - found.back[i]) / step;
-            found.forth[i] = (found.forth[i] - here[i]) / step;
+            found.back[i] = (at.values[i] - found.back[i]) / step;
+            found.forth[i] = (found.forth[i] - at.values[i]) / step;
         }
         return found;
     }
 
     // True if no invariant changes along a derivative of double precision.
-    bool are_kept(const double *f, const double *G) const {
+    bool are_kept(const Point &at) const {
         for (int64_t j = 0; j < m_; ++j) {
             Single single;
-            single.add(f[j]);
+            single.add(at.f[j]);
             if (single) return false;
         }
-        for (int64_t i = 0; i < l_; ++i) {
-            const double *row = G + i * m_;
-            if (!(std::abs(dot(row, f, m_)) <= INVARIANCE_TOLERANCE * abs_dot(row, f, m_))) return false;
-        }
+        for (const double *row = at.G; row < at.G + l_ * m_; row += m_)
+            if (!(std::abs(dot(row, at.f, m_)) <= INVARIANCE_TOLERANCE * abs_dot(row, at.f, m_))) return false;
         return true;
     }
 
@@ -233,8 +226,8 @@ class InvariantFunctions {
     }
 
     // True if the values are the same at two other times.
-    bool are_fixed(double t, const double *y, const double *here, double tau,
-                   const std::tuple<double, double> &interval) const {
+    bool are_fixed(const Point &at, double tau, const Interval &interval) const {
+        const double t = at.t;
         const auto [low, high] = std::minmax(std::get<0>(interval), std::get<1>(interval));
         const double before = t - low, after = high - t, room = std::max(before, after);
         const double side = after >= before ? 1.0 : -1.0, far = t + side * std::min(room, tau);
@@ -242,25 +235,24 @@ class InvariantFunctions {
         const bool centred = std::min(before, after) >= TIME_ROOM * TIME_SHARE * tau;
         const double step = centred ? std::nearbyint(std::log2(TIME_SHARE * tau))
                                     : std::floor(std::log2(std::min(TIME_SHARE * tau, room / 6.0)));
-        return have_values(far, y, here) && have_values(t + side * std::exp2(step), y, here);
+        return have_values(far, at.y, at.values) && have_values(t + side * std::exp2(step), at.y, at.values);
     }
 
     // True if the gradients agree with differences along two directions, `ways`, of values that have double precision.
-    bool have_right_gradients(double t, const double *y, const double *f, const double *G, const double *here,
-                              double tau, const double *ways) const {
-        const double moving = largest(f), size = largest(y);
+    bool have_right_gradients(const Point &at, double tau, const double *ways) const {
+        const double moving = largest(at.f), size = largest(at.y);
         const double reach = size > 0.0 && moving > 0.0 ? std::min(tau, size / moving) : tau;
         std::vector<Single> single(l_);
-        for (int64_t i = 0; i < l_; ++i) single[i].add(here[i]);
+        for (int64_t i = 0; i < l_; ++i) single[i].add(at.values[i]);
         Buffer way(m_), ends[2] = {Buffer(l_), Buffer(l_)};
         const int width = static_cast<int>(m_ / n_);
         for (const double *direction : {ways, ways + m_}) {
             for (int64_t j = 0; j < m_; ++j)
-                way[j] = direction[j] * (modulus(y, j / width) + reach * modulus(f, j / width));
-            evaluate(t, shifted(y, CHECK_STEP, way.data()).data(), ends[0].data());
-            evaluate(t, shifted(y, -CHECK_STEP, way.data()).data(), ends[1].data());
+                way[j] = direction[j] * (modulus(at.y, j / width) + reach * modulus(at.f, j / width));
+            evaluate(at.t, shifted(at.y, CHECK_STEP, way.data()).data(), ends[0].data());
+            evaluate(at.t, shifted(at.y, -CHECK_STEP, way.data()).data(), ends[1].data());
             for (int64_t i = 0; i < l_; ++i) {
-                const double *row = G + i * m_, above = ends[0][i], below = ends[1][i];
+                const double *row = at.G + i * m_, above = ends[0][i], below = ends[1][i];
                 const double difference = (above - below) * (0.5 / CHECK_STEP), along = dot(row, way.data(), m_);
                 const double noise = CHECK_NOISE / CHECK_STEP * EPS * std::max(std::abs(above), std::abs(below));
                 if (!(std::abs(difference - along) <= CHECK_TOLERANCE * abs_dot(row, way.data(), m_) + noise))
@@ -298,15 +290,17 @@ class RightHandSide {
         return out;
     }
 
-    Array derivatives(Numbers times, Rows y) {
-        require(kept_.is_valid() && y.type == type_ && y.shape[1] == n_ && y.shape[0] == times.shape[0],
-                "rhs: expected the dtype and the size of the run, and one time for each state");
-        Array out = new_array({y.shape[0], n_}, type_);
+    Array derivatives(nb::handle times, nb::handle states) {
+        require(kept_.is_valid(), "rhs: the functions of the run are gone");
+        int64_t count = 0;
+        const auto *time = memory<const double>(times, "times", NPY_DOUBLE, Bound{count});
+        const auto *y = memory<const double>(states, "y", type_, count, n_);
+        Array out = new_array({count, n_}, type_);
         const int64_t m = n_ * (type_ == NPY_CDOUBLE ? 2 : 1);
-        for (int64_t k = 0; k < y.shape[0]; ++k) {
+        for (int64_t k = 0; k < count; ++k) {
             double *f = out.floats() + k * m;
             try {
-                evaluate(times.data[k], y.data + k * m, f, out, nb::float_(times.data[k]));
+                evaluate(time[k], y + k * m, f, out, nb::float_(time[k]));
             } catch (nb::python_error &error) {
                 if (!error.matches(PyExc_Exception) || error.matches(PyExc_MemoryError)) throw;
                 fill(f, NOT_A_NUMBER, m);
@@ -333,7 +327,12 @@ class RightHandSide {
     std::vector<PythonCall> function_;  // none after `clear`
 };
 
-bool are_finite(PointsOf<const double, false> numbers) { return all_finite(numbers.data, numbers.points); }
+bool are_finite(const nb::object &numbers) {
+    auto *array = reinterpret_cast<PyArrayObject *>(numbers.ptr());
+    const bool floats = PyArray_Check(numbers.ptr()) && PyArray_TYPE(array) == NPY_DOUBLE && PyArray_ISCARRAY_RO(array);
+    if (!floats) throw nb::type_error("are_finite: expected a C-contiguous array of float64");
+    return all_finite(static_cast<const double *>(PyArray_DATA(array)), PyArray_SIZE(array));
+}
 
 }  // namespace
 
@@ -356,23 +355,13 @@ void add_examination(Module module) {
         .def("values", &Functions::values, "t"_a, "y"_a, "Return all values (l,).")
         .def("gradients", &Functions::gradients, "t"_a, "y"_a, "f"_a, "Return all gradients (l, n).")
         .def("is_in_order", &Functions::is_in_order, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "tau"_a, "interval"_a,
-             "directions"_a,
-             "Return True if the checks of precision, gradients and invariance find nothing at the state `y`, where "
-             "the gradients are `G` and the values are `here`.")
+             "directions"_a, "Return True if the checks of precision, gradients `G` and invariance find nothing.")
         .def("look", &Functions::look, "figures"_a, "t"_a, "y"_a, "f"_a, "target"_a, "scales"_a, "tau"_a, "interval"_a,
-             "directions"_a,
-             "Call `note_rates` and `is_in_order` for a state of a run without balances, and return the latter's "
-             "result. If `f` is not finite, return True and note nothing.")
+             "directions"_a, "Call `note_rates` and return `is_in_order`, for a state of a run without balances.")
         .def("rates_by_values", &Functions::rates_by_values, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
-             "scales"_a,
-             "Return the rates of change (l,) of the invariants along `f`, by short differences to both sides. A rate "
-             "is NaN if the two differences disagree, as at a kink, and 0 if it is within the rounding errors of the "
-             "values.")
+             "scales"_a, "Return the rates of change (l,) of the invariants along `f`, by short differences.")
         .def("note_rates", &Functions::note_rates, "figures"_a, "t"_a, "y"_a, "f"_a, "G"_a, "here"_a, "target"_a,
-             "scales"_a, "own"_a = nb::none(),
-             "Update the largest rates of change along `f` in `figures` (l, N_FIGURES), computed from gradients and "
-             "from values. The rates are relative to their terms, and the rates `own` of balances are subtracted "
-             "first.");
+             "scales"_a, "own"_a = nb::none(), "Update the largest rates of change along `f` in `figures`.");
     module.attr("CHECK_STEP") = CHECK_STEP;
     module.attr("CHECK_TOLERANCE") = CHECK_TOLERANCE;
     module.attr("CHECK_NOISE") = CHECK_NOISE;

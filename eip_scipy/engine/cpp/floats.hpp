@@ -41,8 +41,8 @@ inline double norm(const double *a, int64_t n) {
 }
 
 // One value for each of eight members.
-inline Octet norm(const Octet *a, int64_t n) {
-    const Octet square = dot(a, a, n);
+inline Lanes8 norm(const Lanes8 *a, int64_t n) {
+    const Lanes8 square = dot(a, a, n);
     const Mask extreme = !((1e-200 < square) & (square < 1e200));
     if (!any(extreme)) return sqrt(square);
     double norms[LANES];
@@ -53,7 +53,7 @@ inline Octet norm(const Octet *a, int64_t n) {
         for (int64_t i = 0; i < n; ++i) own[i] = a[i].lane(lane);
         norms[lane] = norm(own.data(), n);
     }
-    return Octet::load(norms);
+    return Lanes8::load(norms);
 }
 
 // True if no entry is NaN or infinite: the sum of squares is finite too unless it overflows; x - x is 0 then.

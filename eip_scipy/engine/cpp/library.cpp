@@ -113,27 +113,24 @@ void add_library(nb::module_ &module) {
     using Function = LibraryFunction;
     nb::class_<Function>(module, "LibraryFunction", nb::type_slots(slots),
                          "A function in C++ of one of the package's problems.")
-        .def_prop_ro(
-            "takes_f", [](const Function &f) { return f.takes_f(); },
-            "True if the function takes the derivative f of the state as an argument.")
+        .def_prop_ro("takes_f", &Function::takes_f, "True if the function takes the derivative f of the state.")
         .def_prop_ro(
             "in_place", [](const Function &f) { return !f.returns(); },
             "True if the function fills an argument `out`; False if it returns its value.")
         .def_prop_ro(
             "handle", [](const Function &f) { return address(&f); },
-            "Address of this function's record, the first argument of the function at `call_address`.")
+            "First argument of the function at `call_address`.")
         .def_prop_ro(
             "call_address", [](const Function &) { return address(call_by_handle); },
             "Address of `call_by_handle`, whose signature is in library.cpp.")
         .def_prop_ro(
             "numbers", [](const Function &f) { return f.numbers == 0 ? 1 : f.numbers; },
-            "Number of numbers, or of rows of the state's size, that the function fills; if it is negative, its "
-            "absolute value is the number for each orbit.")
+            "Number of numbers, or of rows of the state's size, that are filled; if negative, that for each orbit.")
         .def_prop_ro(
             "returns_numbers", [](const Function &f) { return f.value == Value::NUMBERS; },
             "True if the function returns as many numbers for states of any size, and does not take f.")
         .def_prop_ro(
-            "octet_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
+            "lanes8_address", [](const Function &f) { return f.own.empty() ? address(f.eight) : 0; },
             "Address of the version for eight states at once; 0 if there is none.")
         .def(
             "bound",
@@ -144,11 +141,8 @@ void add_library(nb::module_ &module) {
                 out.own.assign(given.floats(), given.floats() + given.size());
                 return out;
             },
-            nb::arg("params"),
-            "Return the function with fixed parameters `params`, which it uses instead of the parameters of a run.")
-        .def_prop_ro(
-            "own", [](const Function &f) { return f.own; },
-            "Fixed parameters of the function; empty if it uses the parameters of a run.")
+            "params"_a, "Return the function with fixed parameters, which it uses instead of those of a run.")
+        .def_ro("own", &Function::own, "Fixed parameters of the function; empty if it uses the parameters of a run.")
         .def("__repr__", [](const Function &f) { return nb::str("<{} of eip_scipy>").format(f.name); })
         // Pickled by its name, so that it can be sent to other processes.
         .def("__reduce__", [](const Function &f) {

@@ -4,7 +4,7 @@
 #include <span>
 #include <vector>
 
-#include "octet.hpp"
+#include "lanes8.hpp"
 
 namespace eip {
 
@@ -68,7 +68,7 @@ struct LibraryFunction {
     Value value;
     int64_t numbers;  // of an invariant
     LibraryPointer<double> one;
-    LibraryPointer<Octet> eight;  // null where there is none
+    LibraryPointer<Lanes8> eight;  // null where there is none
     bool (*fits)(int64_t n, int64_t p);
     const char *sizes;                          // what fits
     ApartPointer apart = nullptr;               // null where there is none

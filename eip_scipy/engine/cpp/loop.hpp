@@ -12,86 +12,57 @@ namespace eip {
 // Steps of a run and what it saves. `place` holds [step, row, pending]: pending is 1 between a step and its becoming
 // the current state, so that functions called in between see both of its ends. Of the events there are the values and
 // the rates of change at both ends; a rate that is not known yet is NaN.
+// clang-format off
+#define EIP_SCHEDULE(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(Span, span) FIELD(int64_t, save_every) FIELD(const double *, t_eval, Bound{n_eval}) \
+    FIELD(int64_t *, place, 3) FIELD(double *, clock, 4) FIELD(double *, g, Bound{n_events}) \
+    FIELD(double *, g_new, n_events) FIELD(double *, rate, n_events) FIELD(double *, rate_new, n_events) \
+    FIELD(const double *, g_direction, n_events)
+// clang-format on
 struct Schedule {
-    Span span;
-    int64_t save_every;
-    const double *t_eval;
-    int64_t n_eval;
-    int64_t *place;
-    double *clock, *g, *g_new, *rate, *rate_new;
-    const double *g_direction;
-    int64_t n_events;
+    int64_t n_eval, n_events;
+    EIP_RECORD(EIP_SCHEDULE, "Schedule")
 };
-
-template <class Visit>
-void fields(Schedule &s, Visit &visit) {
-    visit.record("span", "Span", s.span);
-    visit("save_every", s.save_every);
-    visit("t_eval", s.t_eval, Bound{s.n_eval});
-    visit("place", s.place, 3);
-    visit("clock", s.clock, 4);
-    visit("g", s.g, Bound{s.n_events});
-    visit("g_new", s.g_new, s.n_events);
-    visit("rate", s.rate, s.n_events);
-    visit("rate_new", s.rate_new, s.n_events);
-    visit("g_direction", s.g_direction, s.n_events);
-}
 
 struct Saved {
     double *t, *y;
     int64_t rows;
 };
 
-// Roots that the loop has found since Python last read them: the event, the time and the state of each. `left`: how
-// often an event may still happen before it ends the run. If there is too little room for the states of a step's roots,
-// or a root cannot be found, these roots are stored in `pending_*`.
-struct Roots {
-    int64_t *event, *pending_event;
-    double *t, *y, *pending_t;
-    int64_t *count, *pending_count;
-    int64_t capacity;
-    double *left;
-};
-
 // Interpolants of all steps, where they are kept.
 struct Pieces {
     double *first;
-    int64_t *count;
     int64_t capacity;
+};
+
+// Roots that the loop has found since Python last read them: the event, the time and the state of each. `left`: how
+// often an event may still happen before it ends the run. If there is too little room for the states of a step's roots,
+// or a root cannot be found, these roots are stored in `pending_*`. The counts are those of the roots, the interpolants and the
+// pending roots.
+// clang-format off
+#define EIP_ROOTS(FIELD, STATES, PYTHON, DERIVED) \
+    FIELD(int64_t *, event, Bound{capacity}) FIELD(double *, t, capacity) STATES(double *, y, capacity, run.n) \
+    FIELD(int64_t *, counts, 3) FIELD(double *, left, run.events) \
+    FIELD(int64_t *, pending_event, MOST_CROSSINGS * run.events) FIELD(double *, pending_t, MOST_CROSSINGS * run.events)
+// clang-format on
+struct Roots {
+    int64_t capacity;
+    EIP_RECORD(EIP_ROOTS, "Roots")
 };
 
 // Dense output, and what the loop samples by it; `interpolants` are kept where there is room for any.
 struct Samples {
+    static constexpr const char *RECORD = "Dense";
     Dense dense;
     Roots roots;
     Pieces interpolants;
-    double *piece;    // scratch for the interpolant of a step
-    int64_t *counts;  // of the roots, the interpolants and the pending roots
-};
 
-// The dense output's buffers and the run's method are known before.
-template <class Visit>
-void fields(Samples &s, Visit &visit) {
-    Dense &d = s.dense;
-    Roots &roots = s.roots;
-    visit("kind", d.kind);
-    visit("weights", d.weights, Bound{d.polynomials}, Bound{d.columns});
-    visit("c", d.c, Bound{d.further});
-    visit("A", d.A, d.further, Bound{d.A_columns});
-    each(visit, "own_slopes", d.own_slopes, "by_travel", d.by_travel, "shows", d.shows);
-    visit.in_python("options", "Options", false);
-    visit.in_python("work", "Work", false);
-    visit("missed", d.missed, 2);
-    visit("waiting", d.waiting, 2);
-    visit("piece", s.piece, d.floats());
-    visit("event", roots.event, Bound{roots.capacity});
-    visit("t", roots.t, roots.capacity);
-    visit.states("y", roots.y, roots.capacity, visit.sizes.n);
-    visit("counts", s.counts, 3);
-    visit("left", roots.left, visit.sizes.events);
-    visit("pending_event", roots.pending_event, MOST_CROSSINGS * visit.sizes.events);
-    visit("pending_t", roots.pending_t, MOST_CROSSINGS * visit.sizes.events);
-}
+    template <class Visit>
+    void fields(Visit &visit) {
+        dense.fields(visit);
+        roots.fields(visit);
+    }
+};
 
 // Says whether event i goes from the value `before` to the value `after` in the direction that it looks at.
 inline bool crosses(const Schedule &s, int64_t i, double before, double after) {
@@ -193,15 +164,15 @@ inline Code locate(const Run &run, const DenseRun &dense, const Schedule &s, Roo
     const std::vector<Root> found = roots_in_step(run, dense, s, piece);
     const auto number = std::ssize(found);
     const bool lost = std::any_of(found.begin(), found.end(), [](const Root &root) { return std::isnan(root.t); });
-    if (lost || roots.capacity - *roots.count < number) {
+    if (lost || roots.capacity - roots.counts[0] < number) {
         for (const auto &[t, event] : found) {
-            roots.pending_event[*roots.pending_count] = event;
-            roots.pending_t[(*roots.pending_count)++] = t;
+            roots.pending_event[roots.counts[2]] = event;
+            roots.pending_t[roots.counts[2]++] = t;
         }
         return PAUSE;
     }
     for (const auto &[t, event] : found) {
-        int64_t &count = *roots.count;
+        int64_t &count = roots.counts[0];
         roots.event[count] = event;
         roots.t[count] = t;
         interpolate(dense, piece, t, roots.y + count * run.work.m);
@@ -239,9 +210,10 @@ inline Code sample(const Run &run, Samples &samples, const Schedule &s, const do
     const DenseRun dense(samples.dense, run.system);
     Pieces &kept = samples.interpolants;
     double end = s.clock[TIME_NEW];
-    double *piece = kept.capacity > 0 ? kept.first + *kept.count * samples.dense.floats() : samples.piece;
+    int64_t &count = samples.roots.counts[1];
+    double *piece = kept.capacity > 0 ? kept.first + count * samples.dense.floats() : samples.dense.piece;
     describe(run, dense, s.clock[TIME], y, end, y_new, piece);
-    *kept.count += kept.capacity > 0;
+    count += kept.capacity > 0;
     const Code code = any_crossing(s) ? locate(run, dense, s, samples.roots, piece, end) : OK;
     for (int64_t &row = s.place[ROW]; code != PAUSE && row < s.n_eval; ++row) {
         if (s.span.sign * (s.t_eval[row] - end) > 0.0) break;
@@ -309,8 +281,7 @@ template <class AnyRun>
         const int64_t k = place[STEP];
         if (s.clock[TIME] == s.span.t_bound || k >= k_end) return OK;
         if (s.n_eval == 0 && place[ROW] + 2 > saved.rows) return FULL;
-        if (samples && samples->interpolants.capacity > 0 &&
-            *samples->interpolants.count == samples->interpolants.capacity)
+        if (samples && samples->interpolants.capacity > 0 && samples->roots.counts[1] == samples->interpolants.capacity)
             return FULL;
         note_waiting(samples, 0, run.method, w.counters[WAITED], k > 0);
         const int64_t stop = next_stop(run.method, samples, s, k, k_end);

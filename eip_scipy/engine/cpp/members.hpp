@@ -6,40 +6,24 @@
 namespace eip {
 
 // All members: `count` starts, parameters, lengths of first steps and values of the events, and the results of each member. `where` holds the
-// current member and whether it has begun. Rows are saved for each member, or for none if `kept` is false.
+// current member and whether it has begun. Rows are saved for each member, or for none if `kept` is false; their times are the same.
+// clang-format off
+#define EIP_MEMBERS(FIELD, STATES, PYTHON, DERIVED) \
+    STATES(double *, starts, Bound{count}, run.n) FIELD(double *, params, count, run.params) \
+    FIELD(double *, first_steps, count) FIELD(double *, events, count, run.events) FIELD(int64_t, evaluations) \
+    FIELD(double *, sigma, run.m) FIELD(double *, left, run.events) FIELD(double *, t_saved, Bound{n_rows}) \
+    FIELD(bool, kept) STATES(double *, rows, kept ? count : 1, n_rows, run.n) STATES(double *, y, count, run.n) \
+    FIELD(double *, t, count) FIELD(int64_t *, status, count) FIELD(double *, max_residual, count, run.l) \
+    FIELD(int64_t *, counters, count, N_COUNTERS) FIELD(double *, max_correction, count) \
+    FIELD(double *, figures, count, run.l, N_FIGURES) FIELD(double *, suspects, count, N_SUSPECT + 2 * run.m) \
+    FIELD(int64_t *, where, 2)
+// clang-format on
 struct Members {
-    int64_t count, n_rows, evaluations;
-    bool kept;
-    double *starts, *params, *first_steps, *events, *sigma, *left, *t_saved;
-    double *y, *t, *rows, *max_residual, *max_correction, *figures, *suspects;
-    int64_t *status, *counters, *where;
+    int64_t count, n_rows;
+    EIP_RECORD(EIP_MEMBERS, "Members")
 
     Saved saved(int64_t k, const Work &w) const { return {t_saved, rows + (kept ? k * n_rows * w.m : 0), n_rows}; }
 };
-
-template <class Visit>
-void fields(Members &m, Visit &visit) {
-    const Sizes &is = visit.sizes;
-    visit.states("starts", m.starts, Bound{m.count}, is.n);
-    visit("params", m.params, m.count, is.params);
-    visit("first_steps", m.first_steps, m.count);
-    visit("events", m.events, m.count, is.events);
-    visit("evaluations", m.evaluations);
-    visit("sigma", m.sigma, is.m);
-    visit("left", m.left, is.events);
-    visit("kept", m.kept);
-    visit.states("rows", m.rows, m.kept ? m.count : 1, is.rows, is.n);
-    visit.states("y", m.y, m.count, is.n);
-    visit("t", m.t, m.count);
-    visit("status", m.status, m.count);
-    visit("max_residual", m.max_residual, m.count, is.l);
-    visit("counters", m.counters, m.count, N_COUNTERS);
-    visit("max_correction", m.max_correction, m.count);
-    visit("figures", m.figures, m.count, is.l, N_FIGURES);
-    visit("suspects", m.suspects, m.count, N_SUSPECT + 2 * is.m);
-    visit("where", m.where, 2);
-    m.n_rows = is.rows;
-}
 
 // Resets one member or eight: nothing is recorded or counted except the evaluations at the start.
 template <class W>
@@ -94,7 +78,7 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     copy(members.events + k * s.n_events, s.g, s.n_events);
     fill(s.rate, NOT_A_NUMBER, s.n_events);
     if (samples) {
-        *samples->roots.count = 0;
+        samples->roots.counts[0] = 0;
         copy(members.left, samples->roots.left, s.n_events);
     }
     if (s.n_eval > 0 && s.t_eval[0] != t0) return true;
@@ -105,9 +89,9 @@ inline bool begin_member(const Run &run, Samples *samples, const Schedule &s, co
     return true;
 }
 
-// After an event: its time and state are the member's last ones, and no row lies beyond it.
+// After an event: no row lies beyond it.
 inline void end_by_event(const Roots &roots, const Schedule &s, const Members &members, const Work &w) {
-    const int64_t k = members.where[0], root = *roots.count - 1;
+    const int64_t k = members.where[0], root = roots.counts[0] - 1;
     const double t = roots.t[root], *y = roots.y + root * w.m;
     const Saved saved = members.saved(k, w);
     int64_t row = s.place[ROW];
@@ -116,27 +100,18 @@ inline void end_by_event(const Roots &roots, const Schedule &s, const Members &m
         if (row > 0 && saved.t[row - 1] == t) copy(y, saved.y + (row - 1) * w.m, w.m);
     }
     if (members.kept) fill(saved.y + row * w.m, NOT_A_NUMBER, (saved.rows - row) * w.m);
-    members.status[k] = 1;
-    members.t[k] = t;
-    copy(y, members.y + k * w.m, w.m);
 }
 
-inline void end_member(const Run &run, Samples *samples, const Schedule &s, const Members &members, const double *y,
-                       Code code) {
-    const auto &w = run.work;
-    const int64_t k = members.where[0];
-    if (code == ENDED) {
-        end_by_event(samples->roots, s, members, w);
-    } else {
-        members.status[k] = 0;
-        members.t[k] = s.span.t_bound;
-        copy(y, members.y + k * w.m, w.m);
-    }
+// Stores the results of member k, whose buffers are those of `w`.
+inline void store_member(const Work &w, const Members &members, int64_t k, int64_t status, double t, const double *y) {
+    members.status[k] = status;
+    members.t[k] = t;
+    members.max_correction[k] = w.max_correction[0];
+    copy(y, members.y + k * w.m, w.m);
     copy(w.max_residual, members.max_residual + k * w.l, w.l);
     copy(w.trust, members.figures + k * w.l * N_FIGURES, w.l * N_FIGURES);
     copy(w.suspect, members.suspects + k * w.suspect_size(), w.suspect_size());
-    std::copy_n(w.counters, static_cast<int64_t>(N_COUNTERS), members.counters + k * N_COUNTERS);
-    members.max_correction[k] = w.max_correction[0];
+    copy(w.counters, members.counters + k * N_COUNTERS, N_COUNTERS);
 }
 
 // Runs members from where[0] on, up to the given number of steps. OK: all have ended, or more calls are needed; else what has
@@ -154,7 +129,14 @@ inline Code sweep(const AnyRun &run, Samples *samples, const Schedule &s, const 
         steps = std::max<int64_t>(0, steps - (s.place[STEP] - before));
         if (code == OK && s.clock[TIME] != s.span.t_bound) return OK;
         if (code != OK && code != ENDED) return code;
-        end_member(of_any_length(run), samples, s, members, y, code);
+        const double *end = y;
+        double t = s.span.t_bound;
+        if (code == ENDED) {
+            end_by_event(samples->roots, s, members, run.work);
+            t = samples->roots.t[samples->roots.counts[0] - 1];
+            end = samples->roots.y + (samples->roots.counts[0] - 1) * run.work.m;
+        }
+        store_member(of_any_length(run).work, members, k, code == ENDED, t, end);
         if (s.n_events > 0) {  // whose roots the caller takes before those of the next member
             ++k;
             begun = 0;

@@ -2,10 +2,10 @@
 #define EIP_IMPORTS_NUMPY
 #include "module.hpp"
 
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
 #include <atomic>
+#include <optional>
 #include <string>
 #include <string_view>
 #if defined(__x86_64__)
@@ -39,10 +39,6 @@ void raise_broken(const System &system) {
 }
 
 namespace {
-
-using State = StatesOf<double, 1>;
-using ConstState = StatesOf<const double, 1>;
-using Times = ArrayOf<const double, 1>;
 
 // True if the processor supports the other build, for x86-64-v3, and the operating system saves its registers. CPUID is used
 // directly, because the library behind __builtin_cpu_supports is not available with each compiler and on each system.
@@ -78,18 +74,12 @@ class Busy {
     std::atomic<bool> &flag_;
 };
 
-template <class Array>
-void require_shape(const Array &array, const char *name, Lengths shape) {
-    if (std::equal(shape.begin(), shape.end(), array.shape)) return;
-    refuse(PyExc_ValueError, "engine: %s has another shape than the run expects", name);
-}
-
 class Engine {
   public:
     Engine(nb::object method, nb::object options, nb::object work, nb::object functions, nb::object schedule,
            nb::object hooks) {
-        for (const nb::object &object : {method, options, work, functions, schedule, hooks}) kept_.append(object);
-        const Buffers &buffers = buffers_of(work);
+        for (const nb::object &object : {method, options, functions, schedule, hooks}) kept_.append(object);
+        const Buffers buffers(work, kept_);
         type_ = buffers.type;
         data_.work = buffers.work;
         const bool has_tableau = hooks.is_none() || nb::object(hooks.attr("one_step")).is_none();
@@ -107,7 +97,7 @@ class Engine {
         if (native)
             read_pointers(functions, data_.work, data_.options.columns, python.is_none() ? events : 0, kept_, system);
         if (!python.is_none()) {
-            functions_ = std::make_unique<PythonFunctions>(python, buffers.owner(), data_.work, type_, kept_);
+            functions_ = std::make_unique<PythonFunctions>(python, work, data_.work, type_, kept_);
             system.python = functions_.get();
             require(functions_->events() == events,
                     "engine: the number of event functions differs from that in the schedule");
@@ -123,7 +113,7 @@ class Engine {
             const bool jacobian = native ? system.jacobian_pointer.pointer || system.jacobian_pointer.library
                                          : functions_->has_jacobian();
             require(
-                !hooks_ && data_.options.compensated && (data_.multistep.count == 0 || jacobian),
+                !hooks_ && data_.options.compensated && (data_.multistep.corrected_count == 0 || jacobian),
                 "engine: a multistep method needs compensated summation, no hooks, and a Jacobian if it is corrected");
         }
         require(!(data_.method.nystrom || system.second_order) || data_.work.m % 2 == 0,
@@ -134,101 +124,94 @@ class Engine {
     void clear() {
         busy_ = true;
         interpolating_ = true;
-        eight_.reset();
+        batch_.reset();
         functions_.reset();
         hooks_.reset();
         kept_.reset();
     }
 
-    int advance(int64_t k_end, State y, State y_new, ArrayOf<double, 1> t_saved, StatesOf<double, 2> y_saved,
-                std::optional<ArrayOf<double, 2>> pieces) {
+    int advance(int64_t k_end, nb::handle y, nb::handle y_new, nb::handle t_saved, nb::handle y_saved,
+                nb::handle pieces) {
         const Busy busy(busy_);
-        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-        const Saved saved{t_saved.data, checked(y_saved, "y_saved", t_saved.shape[0]), t_saved.shape[0]};
+        double *from = state<double>(y, "y"), *to = state<double>(y_new, "y_new");
+        Saved saved{};
+        saved.t = memory<double>(t_saved, "t_saved", NPY_DOUBLE, Bound{saved.rows});
+        saved.y = memory<double>(y_saved, "y_saved", type_, saved.rows, data_.work.n);
         if (samples_) {
-            require(pieces.has_value(), "engine: `pieces` is None, but dense output needs it");
-            require_shape(*pieces, "pieces", {pieces->shape[0], dense().floats()});
-            samples_->interpolants.first = pieces->data;
-            samples_->interpolants.capacity = pieces->shape[0];
+            Pieces &all = samples_->interpolants;
+            all.first = memory<double>(pieces, "pieces", NPY_DOUBLE, Bound{all.capacity}, dense().floats());
         }
         check_room(saved);
-        if (hooks_) hooks_->set_state(y_new.object);
+        if (hooks_) hooks_->set_state(y_new);
         return stepped([&](const Run &run) { return advance_run(run, samples(), *schedule_, k_end, from, to, saved); });
-    }
-
-    int sweep(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
-        const Busy busy(busy_);
-        nb::list kept;
-        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-        const Members all = swept(members, steps, t_saved, kept);
-        require(!functions_ && !hooks_ && (schedule().n_events == 0 || samples_),
-                "engine: `sweep` needs functions given by addresses, no hooks, and dense output if there are events");
-        check_room(all.saved(0, data_.work));
-        if (samples_) samples_->interpolants.capacity = 0;
-        return stepped([&](const Run &run) { return sweep_members(run, samples(), *schedule_, all, steps, from, to); });
     }
 
     void side_by_side(nb::object functions) {
         const Busy busy(busy_);
         kept_.append(functions);
-        eight_ = std::make_unique<Eight>(data_.method, data_.options, data_.work, octet_system_of(functions, data_));
+        batch_ = std::make_unique<Batch>(data_.method, data_.options, data_.work, batch_functions_of(functions, data_));
     }
 
-    int sweep_octets(nb::object members, int64_t steps, State y, State y_new, ArrayOf<double, 1> t_saved) {
+    int sweep(nb::object members, int64_t steps, nb::handle y, nb::handle y_new) {
         const Busy busy(busy_);
         nb::list kept;
         const Schedule &s = schedule();
-        double *from = checked(y, "y"), *to = checked(y_new, "y_new");
-        const Members all = swept(members, steps, t_saved, kept);
+        double *from = state<double>(y, "y"), *to = state<double>(y_new, "y_new");
+        const Members all = members_of(members, data_, s, type_, kept);
+        require(steps >= 1 && all.n_rows >= 2 && !functions_ && !hooks_ && (s.n_events == 0 || samples_),
+                "engine: `sweep` needs a step or more, two rows or more, functions given by addresses, no hooks, and "
+                "dense output if there are events");
+        check_room(all.saved(0, data_.work));
+        if (samples_) samples_->interpolants.capacity = 0;
+        if (!batch_)
+            return stepped([&](const Run &run) { return sweep_members(run, samples(), s, all, steps, from, to); });
         const bool fixed = s.span.h != 0.0 && s.n_events == 0 && (s.n_eval == 0 || (samples_ && all.kept));
         const int64_t saved = s.n_eval > 0 ? s.n_eval : s.save_every > 0 ? s.span.n_steps / s.save_every + 2 : 2;
-        require(eight_ && fixed && (!all.kept || all.n_rows >= saved),
-                "engine: `sweep_octets` needs functions for eight members, fixed steps without events, a row for each "
-                "saved state, and dense output and kept rows for t_eval");
-        if (samples_) samples_->interpolants.capacity = 0;
-        return stepped(
-            [&](const Run &run) { return eip::sweep_octets(run, *eight_, samples(), s, all, steps, from, to); });
+        require(fixed && (!all.kept || all.n_rows >= saved),
+                "engine: batches of members need fixed steps without events, a row for each saved state, and dense "
+                "output and kept rows for t_eval");
+        return stepped([&](const Run &run) { return sweep_batches(run, *batch_, samples(), s, all, steps, from, to); });
     }
 
     void sample(nb::object dense) {
         const Busy busy(busy_), interpolating(interpolating_);
         kept_.append(dense);
         samples_ = samples_of(dense, data_, schedule_ ? schedule_->n_events : 0, type_, kept_);
-        if (functions_) functions_->add_owner(buffers_of(dense.attr("work")).owner(), kept_);
+        if (functions_) functions_->add_owner(dense.attr("work"), kept_);
     }
 
-    void describe(double t_old, ConstState y_old, double t, ConstState y, ArrayOf<double, 1> piece) {
+    void describe(double t_old, nb::handle y_old, double t, nb::handle y, nb::handle piece) {
         const Busy busy(busy_), interpolating(interpolating_);
-        const Dense &d = dense();
-        const double *from = checked(y_old, "y_old"), *to = checked(y, "y");
-        require_shape(piece, "piece", {d.floats()});
-        stepped([&](const Run &run) { return describe_step(run, d, t_old, from, t, to, piece.data), OK; });
+        double *floats = memory<double>(piece, "piece", NPY_DOUBLE, dense().floats());
+        const double *from = state(y_old, "y_old"), *to = state(y, "y");
+        stepped([&](const Run &run) { return describe_step(run, dense(), t_old, from, t, to, floats), OK; });
     }
 
-    void show(double t, ConstState y, State out) {
+    void show(double t, nb::handle y, nb::handle out) {
         const Busy busy(busy_), interpolating(interpolating_);
         dense();
-        const double *from = checked(y, "y");
-        double *to = checked(out, "out");
+        const double *from = state(y, "y");
+        double *to = state<double>(out, "out");
         const int64_t end = schedule().place[PENDING] == 1;
         stepped([&](const Run &run) { return show_state(run, *samples_, end, t, from, to), OK; });
     }
 
-    void interpolate(ArrayOf<double, 1> piece, Times t, StatesOf<double, 2> out) {
+    void interpolate(nb::handle piece, nb::handle t, nb::handle out) {
         const Busy interpolating(interpolating_);
-        const Dense &d = dense();
-        require_shape(piece, "piece", {d.floats()});
-        require(has_node(d, piece.data), "engine: the interpolant belongs to no node of the history");
-        double *states = checked(out, "out", t.shape[0]);
-        stepped([&](const Run &run) { return interpolate_step(run, d, piece.data, t.data, t.shape[0], states), OK; });
+        int64_t rows = 0;
+        double *floats = memory<double>(piece, "piece", NPY_DOUBLE, dense().floats());
+        const double *times = memory<const double>(t, "t", NPY_DOUBLE, Bound{rows});
+        double *states = memory<double>(out, "out", type_, rows, data_.work.n);
+        require(has_node(dense(), floats), "engine: the interpolant belongs to no node of the history");
+        stepped([&](const Run &run) { return interpolate_step(run, dense(), floats, times, rows, states), OK; });
     }
 
-    std::tuple<int, double, Array, Array> step(int64_t k, double t, ConstState y, ConstState f) {
+    std::tuple<int, double, Array, Array> step(int64_t k, double t, nb::handle y, nb::handle f) {
         const Busy busy(busy_);
         const Work &w = data_.work;
         const Schedule &s = schedule();
-        const double *from = checked(y, "y");
-        copy(checked(f, "f"), w.row(0), w.m);
+        const double *from = state(y, "y");
+        copy(state(f, "f"), w.row(0), w.m);
         s.clock[TIME] = t;
         if (stepped_) copy(w.rate(w.stages), w.rate(0), w.balances);
         Array y_new = new_array({w.n}, type_), f_new = new_array({w.n}, type_);
@@ -239,51 +222,43 @@ class Engine {
         return {code, s.clock[TIME_NEW], std::move(y_new), std::move(f_new)};
     }
 
-    int project(double t_old, ConstState y, double t, bool last, State y_new) {
+    int project(double t_old, nb::handle y, double t, bool last, nb::handle y_new) {
         const Busy busy(busy_);
-        const Step step{t_old, t, t - t_old, checked(y, "y"), checked(y_new, "y_new"), true, last};
-        if (hooks_) hooks_->set_state(y_new.object);
+        const Step step{t_old, t, t - t_old, state(y, "y"), state<double>(y_new, "y_new"), true, last};
+        if (hooks_) hooks_->set_state(y_new);
         return stepped([&](const Run &run) { return project_once(run, step); });
     }
 
-    void values(Times t, StatesOf<const double, 2> y, ArrayOf<double, 2> out,
-                std::optional<ArrayOf<const double, 2>> params) {
+    void values(nb::handle t, nb::handle y, nb::handle out, nb::handle params) {
         const Busy busy(busy_);
         const Work &w = data_.work;
-        const System &system = data_.system;
-        const npy_intp rows = t.shape[0];
-        const double *states = checked(y, "y", rows);
-        require_shape(out, "out", {rows, w.l});
-        const double *given = params && system.n_params > 0 ? params->data : nullptr;
-        if (given) require_shape(*params, "params", {rows, system.n_params});
+        const int64_t p = data_.system.n_params;
+        int64_t rows = 0;
+        const double *times = memory<const double>(t, "t", NPY_DOUBLE, Bound{rows}), *given = nullptr;
+        const double *states = memory<const double>(y, "y", type_, rows, w.n);
+        double *found = memory<double>(out, "out", NPY_DOUBLE, rows, w.l);
+        if (!params.is_none() && p > 0) given = memory<const double>(params, "params", NPY_DOUBLE, rows, p);
         stepped([&](const Run &run) {
-            for (npy_intp k = 0; k < rows; ++k) {
-                if (given) copy(given + k * system.n_params, system.params, system.n_params);
-                run.system.inv(run.work, t.data[k], states + k * w.m, out.data + k * w.l);
+            for (int64_t k = 0; k < rows; ++k) {
+                if (given) copy(given + k * p, run.system.params, p);
+                run.system.inv(w, times[k], states + k * w.m, found + k * w.l);
             }
             return OK;
         });
     }
 
-    void start(ConstState y, ConstState f, double tau) {
+    void start(nb::handle y, nb::handle f, double tau) {
         const Busy busy(busy_);
-        start_figures(checked(y, "y"), checked(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
+        start_figures(state(y, "y"), state(f, "f"), tau, data_.method, hooks_.get(), data_.options, data_.work);
     }
 
     // The objects that the garbage collector visits.
     nb::handle kept() const { return kept_; }
 
   private:
-    // The memory of a state, or of `rows` of them.
-    template <class T, int AXES>
-    T *checked(const StatesOf<T, AXES> &array, const char *name, npy_intp rows = 1) const {
-        if (array.type != type_)
-            refuse(PyExc_ValueError, "engine: %s has another dtype than the states of the run", name);
-        if constexpr (AXES == 1)
-            require_shape(array, name, {data_.work.n});
-        else
-            require_shape(array, name, {rows, data_.work.n});
-        return array.data;
+    template <class T = const double>
+    T *state(nb::handle object, const char *name) const {
+        return memory<T>(object, name, type_, data_.work.n);
     }
     const Schedule &schedule() const {
         if (!schedule_)
@@ -302,21 +277,12 @@ class Engine {
         bool good = row >= 0 && row <= saved.rows && schedule().n_eval < std::max<int64_t>(saved.rows, 1);
         if (data_.method.multistep) check_history(*data_.method.multistep);
         if (samples_) {
-            const int64_t roots = *samples_->roots.count, pieces = *samples_->interpolants.count;
+            const int64_t roots = samples_->roots.counts[0], pieces = samples_->roots.counts[1];
             good &= roots >= 0 && pieces >= 0 && pieces <= samples_->interpolants.capacity;
         }
         require(good,
                 "engine: the position in the schedule or the counts of dense output are outside their rows, or there "
                 "are too few rows");
-    }
-
-    // Members of an ensemble as a sweep takes them.
-    Members swept(nb::handle members, int64_t steps, const ArrayOf<double, 1> &t_saved, nb::list &kept) {
-        const int64_t rows = t_saved.shape[0];
-        Members found = members_of(members, data_, schedule(), rows, type_, kept);
-        found.t_saved = t_saved.data;
-        require(steps >= 1 && rows >= 2, "engine: `steps` must be at least 1, and t_saved must have at least two rows");
-        return found;
     }
 
     // Make a step or more by `call`, which takes a Run, without the GIL if no function is Python's.
@@ -341,7 +307,7 @@ class Engine {
     Data data_{};
     std::optional<Schedule> schedule_;
     std::optional<Samples> samples_;
-    std::unique_ptr<Eight> eight_;
+    std::unique_ptr<Batch> batch_;
     std::unique_ptr<PythonFunctions> functions_;
     std::unique_ptr<PythonHooks> hooks_;
     int type_ = NPY_DOUBLE;
@@ -359,30 +325,23 @@ void add_engine(nb::module_ &m) {
                      "schedule: Schedule | None = None, hooks: typing.Any = None) -> None"))
         .def("advance", &Engine::advance, "k_end"_a, "y"_a, "y_new"_a, "t_saved"_a, "y_saved"_a, "pieces"_a.none(),
              "Make steps up to step `k_end`, or until something else stops the loop, and return the reason as a code. "
-             "If `pieces` (rows, floats) has rows, it is filled with the interpolants of all steps.")
-        .def("sweep", &Engine::sweep, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
-             "Run members of an ensemble one after the other, for `steps` steps in all (slightly more if a multistep "
-             "method is near its end). Return OK, or a code for what happened to the current member. `members.where` "
-             "holds the current member and whether it has begun.")
+             "With dense output, `pieces` (rows, floats) is filled with the interpolants of all steps if it has rows.")
         .def("side_by_side", &Engine::side_by_side, "functions"_a,
-             "Set the functions for eight members with which `sweep_octets` runs members from now on. Like those of "
-             "the run, `functions` holds addresses.")
-        .def("sweep_octets", &Engine::sweep_octets, "members"_a, "steps"_a, "y"_a, "y_new"_a, "t_saved"_a,
-             "Run members like `sweep`, in batches of eight that step together; `steps` counts steps of a batch. A "
-             "member whose status is not set afterwards must be run alone.")
+             "Let `sweep` run members in batches of eight from now on, with these functions for eight members.")
+        .def("sweep", &Engine::sweep, "members"_a, "steps"_a, "y"_a, "y_new"_a,
+             "Run members of an ensemble for `steps` steps in all, or slightly more. Return OK, or a code for what "
+             "happened to the current member. A member of a batch whose status is not set must be run alone.")
         .def("step", &Engine::step, "k"_a, "t"_a, "y"_a, "f"_a,
              "Make step `k` from the state `y` at time `t`, where the derivative is `f`. Return (status, t_new, y_new, "
              "f_new).")
         .def("project", &Engine::project, "t_old"_a, "y"_a, "t"_a, "last"_a, "y_new"_a,
              "Project the state work.y_hat onto the invariants, write the result to `y_new`, and return the code.")
         .def("values", &Engine::values, "t"_a, "y"_a, "out"_a, "params"_a = nb::none(),
-             "Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n). If `params` (m, p) is "
-             "given, each state has its own row of parameters.")
+             "Fill `out` (m, l) with the invariants at the times `t` (m,) and states `y` (m, n), each with its own row "
+             "of parameters if `params` (m, p) is given.")
         .def("start", &Engine::start, "y"_a, "f"_a, "tau"_a,
-             "Set the sizes of the invariants' terms at the start of a run, from the state `y`, the derivative `f`, "
-             "the length `tau` of a step, work.values and the gradients work.G.")
-        .def("sample", &Engine::sample, "dense"_a,
-             "Make dense output from now on, with the buffers of the record `dense`.")
+             "Set the sizes of the invariants' terms at the start, where work.values and work.G are known.")
+        .def("sample", &Engine::sample, "dense"_a, "Make dense output from now on, as the record `dense` says.")
         .def("describe", &Engine::describe, "t_old"_a, "y_old"_a, "t"_a, "y"_a, "piece"_a,
              "Fill `piece` with the interpolant over the last step, from (t_old, y_old) to (t, y).")
         .def("interpolate", &Engine::interpolate, "piece"_a, "t"_a, "out"_a,

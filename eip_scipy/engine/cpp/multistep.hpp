@@ -372,7 +372,7 @@ template <class AnyRun>
 inline void correct_node(const AnyRun &run, double t, double *q, const double *older, double *a) {
     const Multistep &ms = *run.method.multistep;
     const auto &w = run.work;
-    const int64_t first = ms.first, end = first + ms.count;
+    const int64_t first = ms.corrected_first, end = first + ms.corrected_count;
     const double square = ms.h * ms.h, weight = ms.correction[ms.order];
     double *change = ms.change;
     for (int64_t i = first; i < end; ++i) change[i] = square * (older[i] + weight * a[i]);
@@ -423,12 +423,14 @@ inline Code add_node(const AnyRun &run, bool is_predicted, bool predicts) {
     if (!is_predicted)
         predict(latest(ms, ms.predict_q, ms.order), two_product(ms.h, ms.h), ms.sums, ms.sums + ms.pitch, y);
     if (ms.uses_v || (ms.balances > 0 && !come_with_pulls(run))) predict_velocities(ms, y);
-    if (ms.count > 0) row_sums(latest(ms, ms.correction, ms.order), older, ms.first, ms.first + ms.count);
+    if (ms.corrected_count > 0)
+        row_sums(latest(ms, ms.correction, ms.order), older, ms.corrected_first,
+                 ms.corrected_first + ms.corrected_count);
     double *a = next_row(ms);
     accelerate_node(run, t, y, a);
     ++w.counters[NFEV];
     if (run.system.MEMBERS == 1 && !is_finite_row(ms, a)) return NOT_FINITE;
-    if (ms.count > 0) correct_node(run, t, y, older, a);
+    if (ms.corrected_count > 0) correct_node(run, t, y, older, a);
     if (ms.balances > 0) add_rates(run, t, y);
     ++ms.place[NEWEST_ROW];
     ++ms.place[NEWEST];

@@ -13,28 +13,21 @@
 
 namespace eip {
 
-namespace {
-
-[[noreturn]] void refuse_array(nb::handle object, const char *name, int type, Lengths shape) {
+void *memory_of(nb::handle object, const char *name, int type, std::span<const npy_intp> shape, bool read) {
+    auto *array = reinterpret_cast<PyArrayObject *>(object.ptr());
+    const bool plain = is_plain(object.ptr(), type, static_cast<int>(shape.size()));
+    if (plain && std::equal(shape.begin(), shape.end(), PyArray_DIMS(array)) && (read || PyArray_ISWRITEABLE(array)))
+        return PyArray_DATA(array);
     nb::list lengths;
-    for (const npy_intp length : shape) lengths.append(length);
+    for (const npy_intp length : shape) length < 0 ? lengths.append("any") : lengths.append(length);
     const auto dtype = owned(reinterpret_cast<PyObject *>(PyArray_DescrFromType(type)));
     const nb::tuple wanted(lengths);
     if (!PyArray_Check(object.ptr()))
         refuse(PyExc_TypeError, "engine: %s is %.80R; expected an array, %S of shape %S", name, object.ptr(),
                dtype.ptr(), wanted.ptr());
     const nb::object has = object.attr("dtype"), came = object.attr("shape");
-    refuse(PyExc_ValueError, "engine: %s is %S of shape %S; expected writable, aligned, C-contiguous %S of shape %S",
-           name, has.ptr(), came.ptr(), dtype.ptr(), wanted.ptr());
-}
-
-}  // namespace
-
-void *memory(nb::handle object, const char *name, int type, Lengths shape, nb::list &kept) {
-    auto *array = reinterpret_cast<PyArrayObject *>(object.ptr());
-    if (!is_plain(object.ptr(), type, shape) || !PyArray_ISWRITEABLE(array)) refuse_array(object, name, type, shape);
-    kept.append(object);
-    return PyArray_DATA(array);
+    refuse(PyExc_ValueError, "engine: %s is %S of shape %S; expected %saligned, C-contiguous %S of shape %S", name,
+           has.ptr(), came.ptr(), read ? "" : "writable, ", dtype.ptr(), wanted.ptr());
 }
 
 void require_floats(const char *name, int64_t total, int64_t expected) {
@@ -79,46 +72,32 @@ class Reader {
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
     void operator()(const char *name, T *&place, Axes... axes) {
-        place = static_cast<T *>(array(name, TYPE<T>, axes...));
+        place = memory<std::remove_const_t<T>>(next(name), name, TYPE<T>, axes...);
     }
-
     template <class... Axes>
     void states(const char *name, double *&place, Axes... axes) {
-        place = static_cast<double *>(array(name, type_, axes...));
+        place = memory<double>(next(name), name, type_, axes...);
     }
-
     template <class Record>
-    void record(const char *name, const char *, Record &place) {
+        requires(sizeof(Record::RECORD) > 0)
+    void operator()(const char *name, Record &place) {
         const nb::object inner = next(name);
         Reader reader(inner, type_, sizes, kept_);
-        fields(place, reader);
+        place.fields(reader);
     }
-
     void in_python(const char *, const char *, bool) { ++place_; }
 
     const Sizes sizes;
 
   private:
-    // To look a field up by its name takes most of the time of reading it.
+    // To look a field up by its name takes most of the time of reading it. A tuple keeps its items; others are kept here.
     nb::object next(const char *name) {
         const Py_ssize_t place = place_++;
-        if (!PyTuple_Check(record_.ptr()) || place >= PyTuple_Size(record_.ptr())) return record_.attr(name);
-        return nb::borrow(PyTuple_GetItem(record_.ptr(), place));
-    }
-
-    template <class... Axes>
-    void *array(const char *name, int type, Axes... axes) {
-        const nb::object object = next(name);
-        int axis = 0;
-        const auto length = [&](auto given) -> npy_intp {
-            if constexpr (std::is_same_v<decltype(given), Bound>)
-                return given.length = is_plain(object.ptr(), type, sizeof...(Axes))
-                                          ? PyArray_DIM(reinterpret_cast<PyArrayObject *>(object.ptr()), axis++)
-                                          : 0;
-            else
-                return ++axis, given;
-        };
-        return memory(object, name, type, {length(axes)...}, kept_);
+        if (PyTuple_Check(record_.ptr()) && place < PyTuple_Size(record_.ptr()))
+            return nb::borrow(PyTuple_GetItem(record_.ptr(), place));
+        nb::object found = record_.attr(name);
+        kept_.append(found);
+        return found;
     }
 
     nb::handle record_;
@@ -129,8 +108,9 @@ class Reader {
 
 template <class Record>
 void read(Record &place, nb::handle record, int type, const Sizes &sizes, nb::list &kept) {
+    kept.append(record);
     Reader reader(record, type, sizes, kept);
-    fields(place, reader);
+    place.fields(reader);
 }
 
 // Collects the names of a record's fields, their types for type checkers, and what they are if they are left out.
@@ -143,15 +123,18 @@ class Names {
     template <class T, class... Axes>
         requires(sizeof...(Axes) > 0)
     void operator()(const char *name, T *&, Axes...) {
-        add(name, ArrayOf<T, 1>::ARGUMENT.text);
+        add(name, TYPE<T> == NPY_DOUBLE  ? "numpy.typing.NDArray[numpy.float64]"
+                  : TYPE<T> == NPY_INT64 ? "numpy.typing.NDArray[numpy.int64]"
+                                         : "numpy.typing.NDArray[numpy.uint64]");
     }
     template <class... Axes>
     void states(const char *name, double *&, Axes...) {
-        add(name, NUMBERS.text);
+        add(name, "numpy.typing.NDArray[typing.Any]");
     }
     template <class Record>
-    void record(const char *name, const char *type, Record &) {
-        add(name, type);
+        requires(sizeof(Record::RECORD) > 0)
+    void operator()(const char *name, Record &) {
+        add(name, Record::RECORD);
     }
     void in_python(const char *name, const char *type, bool may_be_missing) {
         add(name, type);
@@ -170,26 +153,29 @@ class Names {
 };
 
 template <class Record>
-void add_record(nb::module_ &module, const char *name) {
+void add_record(nb::module_ &module) {
     Record record{};
     Names names;
-    fields(record, names);
-    nb::object type =
-        nb::module_::import_("collections")
-            .attr("namedtuple")(name, names.names, "defaults"_a = names.defaults, "module"_a = "eip_scipy.engine.data");
+    record.fields(names);
+    nb::object type = nb::module_::import_("collections")
+                          .attr("namedtuple")(Record::RECORD, names.names, "defaults"_a = names.defaults,
+                                              "module"_a = "eip_scipy.engine.data");
     type.attr("__annotations__") = names.types;
-    type.attr("__doc__") =
-        "Record that the engine reads. The functions `fields` in engine/cpp (data.hpp, loop.hpp, members.hpp) list its "
-        "fields, and comments there explain them.";
-    module.attr(name) = type;
+    type.attr("__doc__") = "Record that the engine reads; lists in engine/cpp (EIP_RECORD) name its fields.";
+    module.attr(Record::RECORD) = type;
 }
 
 }  // namespace
 
 Method method_of(nb::handle method, bool has_tableau, nb::list &kept) {
     Method m{};
-    read(m, method, NPY_DOUBLE, {.tableau = has_tableau}, kept);
-    if (!has_tableau) return m;
+    if (!has_tableau) {
+        Reader reader(method, NPY_DOUBLE, {}, kept);
+        reader("b", m.b, Bound{m.stages});
+        reader("c", m.c, m.stages);
+        return reader("exponent", m.exponent), m;
+    }
+    read(m, method, NPY_DOUBLE, {}, kept);
     require(m.columns >= m.stages - 1, "engine: A has too few columns");
     require(m.n_e <= m.stages + 1 && m.n_e_v <= m.stages + 1 && (!m.paired || m.n_e_low >= m.n_e),
             "engine: e or e_v has more weights than the stages plus one, or e_low has fewer weights than e");
@@ -210,7 +196,8 @@ Multistep multistep_of(nb::handle record, const Work &w, nb::list &kept) {
     Multistep ms{};
     read(ms, record, NPY_DOUBLE, {.m = w.m, .l = w.l}, kept);
     check_history(ms);
-    const bool fits = ms.first >= 0 && ms.count >= 0 && ms.first <= ms.half && ms.count <= ms.half - ms.first;
+    const bool fits = ms.corrected_first >= 0 && ms.corrected_count >= 0 && ms.corrected_first <= ms.half &&
+                      ms.corrected_count <= ms.half - ms.corrected_first;
     const bool sizes =
         fits && ms.order >= 4 && ms.pitch % 4 == 0 && ms.rows > 2 * ms.order && ms.pitch >= ms.half && ms.middle >= 0;
     require(ms.balances == w.balances && (ms.balances == 0 || !ms.brief),
@@ -227,9 +214,9 @@ void check_history(const Multistep &ms) {
 }
 
 static void check_blocks(const Blocks &b, int64_t m) {
-    check_places(b.start, b.starts, b.member, b.members, m, "groups");
+    check_places(b.start, b.starts, b.member, b.members, m, "blocks");
     const bool consecutive = b.size == 0 || b.size * b.count == m;
-    require(b.starts >= 1 && (b.width == 1 || b.width == 2) && consecutive, "engine: groups do not fit the state");
+    require(b.starts >= 1 && (b.width == 1 || b.width == 2) && consecutive, "engine: blocks do not fit the state");
 }
 
 static void check_balances(const Balances &b, const Work &w) {
@@ -312,9 +299,7 @@ static void check_interpolant(const Dense &d, int64_t stages) {
 Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, nb::list &kept) {
     Samples samples{};
     Dense &d = samples.dense;
-    const nb::object work = dense.attr("work");
-    const Buffers &buffers = buffers_of(work);
-    kept.append(work);
+    const Buffers buffers(dense.attr("work"), kept);
     d.work = buffers.work;
     require(
         buffers.type == type && d.work.n == run.work.n && d.work.l == run.work.l && d.work.stages >= 0 &&
@@ -326,18 +311,13 @@ Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, 
     read(samples, dense, type, {.n = d.work.n, .events = events}, kept);
     require(!d.own_slopes || d.work.stages >= 1, "engine: dense.work needs at least one stage if own_slopes is True");
     check_interpolant(d, run.work.stages);
-    samples.roots.count = samples.counts;
-    samples.interpolants.count = samples.counts + 1;
-    samples.roots.pending_count = samples.counts + 2;
     return samples;
 }
 
-Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int64_t rows, int type,
-                   nb::list &kept) {
+Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int type, nb::list &kept) {
     Members m{};
     const Work &w = run.work;
-    read(m, members, type,
-         {.n = w.n, .m = w.m, .l = w.l, .events = schedule.n_events, .params = run.system.n_params, .rows = rows},
+    read(m, members, type, {.n = w.n, .m = w.m, .l = w.l, .events = schedule.n_events, .params = run.system.n_params},
          kept);
     require(m.where[0] >= 0 && m.where[0] <= m.count, "engine: members.where is outside the members");
     return m;
@@ -353,7 +333,7 @@ static void take(const LibraryFunction &function, LibraryCall<double> &place) {
              function.together,
              function.with_energy};
 }
-static void take(const LibraryFunction &function, LibraryCall<Octet> &place) {
+static void take(const LibraryFunction &function, LibraryCall<Lanes8> &place) {
     if (function.own.empty()) place = {function.eight};
 }
 
@@ -419,7 +399,9 @@ static void read_shifts(nb::handle functions, const Work &w, nb::list &kept, Sys
     if (!wanted) return;
     system.shifts.m = w.m;
     system.shifts.width = w.m / w.n;
-    system.shifts.floors = static_cast<double *>(memory(functions.attr("floors"), "floors", NPY_DOUBLE, {w.n}, kept));
+    const nb::object floors = functions.attr("floors");
+    kept.append(floors);
+    system.shifts.floors = memory<double>(floors, "floors", NPY_DOUBLE, w.n);
     system.shifts.state.resize(w.m);
 }
 
@@ -466,8 +448,8 @@ void read_pointers(nb::handle functions, const Work &w, const Columns &columns, 
     system.by_pointer = true;
     system.second_order = truth(functions.attr("second_order"));
     const nb::object params = functions.attr("params");
-    system.n_params = PyArray_Check(params.ptr()) ? Array(params, nb::detail::borrow_t()).size() : 0;
-    system.params = static_cast<double *>(memory(params, "params", NPY_DOUBLE, {system.n_params}, kept));
+    kept.append(params);
+    system.params = memory<double>(params, "params", NPY_DOUBLE, Bound{system.n_params});
     const int64_t size = system.second_order ? w.m / 2 : w.m, p = system.n_params;
     system.rhs_pointer = pointer_of<Native<ValuePointer>>(functions.attr("rhs"), "rhs", size, size, p);
     if (columns.count > 0) {
@@ -498,14 +480,14 @@ void read_pointers(nb::handle functions, const Work &w, const Columns &columns, 
     if (!system.balances.empty()) system.pulls.resize(w.m / 2);
 }
 
-OctetSystem octet_system_of(nb::handle functions, const Data &run) {
-    OctetSystem system;
+BatchFunctions batch_functions_of(nb::handle functions, const Data &run) {
+    BatchFunctions system;
     const Work &w = run.work;
     const int64_t size = run.system.second_order ? w.n / 2 : w.n, p = run.system.n_params;
-    using Values = Native<ValuePointer, Octet>;
+    using Values = Native<ValuePointer, Lanes8>;
     system.rhs_pointer = pointer_of<Values>(functions.attr("rhs"), "rhs", size, size, p);
     system.inv_pointers = pointers_of<Values>(functions, "inv", w.l, w.n, p);
-    system.grad_pointers = pointers_of<Native<GradientPointer, Octet>>(functions, "grad", w.l * w.n, w.n, p);
+    system.grad_pointers = pointers_of<Native<GradientPointer, Lanes8>>(functions, "grad", w.l * w.n, w.n, p);
     system.second_order = run.system.second_order;
     system.params.resize(p);
     system.scratch.resize(w.n);
@@ -513,129 +495,92 @@ OctetSystem octet_system_of(nb::handle functions, const Data &run) {
     const Options &o = run.options;
     const nb::object jacobian = functions.attr("jacobian");
     if (!jacobian.is_none())
-        system.jacobian_pointer = pointer_of<Native<GradientPointer, Octet>>(jacobian, "jacobian", w.n / 2, w.n / 2, p);
+        system.jacobian_pointer =
+            pointer_of<Native<GradientPointer, Lanes8>>(jacobian, "jacobian", w.n / 2, w.n / 2, p);
     const Multistep *ms = run.method.multistep;
-    const bool steps =
-        ms ? !ms->brief && !ms->level && (ms->count == 0 || !jacobian.is_none()) : !o.compensated && o.every >= 1;
+    const bool steps = ms ? !ms->brief && !ms->level && (ms->corrected_count == 0 || !jacobian.is_none())
+                          : !o.compensated && o.every >= 1;
     const bool plain = w.n == w.m && o.pairs == 0 && !o.adaptive && o.iterations == 1 && o.direction == NEW;
     require(!run.system.python && plain && steps,
             "engine: members with these options cannot be run in batches of eight");
     return system;
 }
 
+Buffers::Buffers(nb::handle record, nb::list &kept) : record(record) {
+    kept.append(record);
+    const auto length = [&](const char *name, int axes, int axis) {
+        const nb::object array = nb::getattr(record, name, nb::none());
+        if (!PyArray_Check(array.ptr()) || PyArray_NDIM(nb::borrow<Array>(array).get()) != axes)
+            refuse(PyExc_TypeError, "engine: work must be a record Work of arrays, and not %.80R", record.ptr());
+        return PyArray_DIM(nb::borrow<Array>(array).get(), axis);
+    };
+    work.n = length("K", 2, 1);
+    type = PyArray_TYPE(array("K").get()) == NPY_CDOUBLE ? NPY_CDOUBLE : NPY_DOUBLE;
+    work.m = type == NPY_CDOUBLE ? 2 * work.n : work.n;
+    work.l = length("R", 2, 0);
+    work.stages = length("K", 2, 0) - 1;
+    work.balances = length("level", 1, 0);
+    blocks = length("scale", 1, 0);
+    require(work.stages >= 0, "engine: work.K has no rows");
+    Reader reader(record, type, {.blocks = blocks}, kept);
+    work.fields(reader);
+}
+
 namespace {
 
-// One for each buffer, so that a sanitizer sees where each one ends.
-using Memory = std::vector<std::vector<double>>;
-
-// Calls `found(name, place, type, shape)` for each buffer.
-template <class Found>
-struct Finder {
-    Found found;
+// Makes the arrays of a run's buffers, filled with 0.
+struct Maker {
     int type;
+    Sizes sizes;
+    nb::list arrays;
 
     template <class T>
-    void operator()(const char *name, T *&place, std::initializer_list<int64_t> shape) {
-        found(name, place, TYPE<T>, std::span(shape));
+    void operator()(const char *, T *&place, auto... lengths) {
+        make(TYPE<T>, place, {static_cast<npy_intp>(lengths)...});
     }
-    void states(const char *name, double *&place, std::initializer_list<int64_t> shape) {
-        found(name, place, type, std::span(shape));
+    void states(const char *, double *&place, auto... lengths) {
+        make(type, place, {static_cast<npy_intp>(lengths)...});
+    }
+
+  private:
+    template <class T>
+    void make(int type, T *&place, Lengths shape) {
+        const auto array =
+            owned<Array>(PyArray_ZEROS(static_cast<int>(shape.size()), const_cast<npy_intp *>(shape.begin()), type, 0));
+        place = reinterpret_cast<T *>(array.floats());
+        arrays.append(array);
     }
 };
 
-template <class Found>
-void for_each_buffer(Work &work, int64_t blocks, int type, Found found) {
-    Finder<Found> finder{found, type};
-    each_buffer(work, blocks, finder);
-}
+nb::handle work_type;  // the record's class in Python, which the module keeps
 
-}  // namespace
-
-Buffers::Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances)
-    : blocks(blocks) {
+nb::object new_work(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances) {
     require(n >= 0 && stages >= 0 && invariants >= 0 && blocks >= 0 && balances >= 0,
             "engine: a negative number of buffers");
     PyArray_Descr *found = nullptr;
     if (!PyArray_DescrConverter(dtype.ptr(), &found)) throw nb::python_error();
     const auto kept = owned(reinterpret_cast<PyObject *>(found));
-    type = found->type_num;
-    require(type == NPY_DOUBLE || type == NPY_CDOUBLE, "engine: a state is of float64 or complex128");
-    work.n = n;
-    work.m = type == NPY_CDOUBLE ? 2 * n : n;
-    work.l = invariants;
-    work.stages = stages;
-    work.balances = balances;
-    auto own = std::make_unique<Memory>();
-    for_each_buffer(work, blocks, type, [&own]<class T>(const char *, T *&place, int type, auto shape) {
-        static_assert(sizeof(T) == sizeof(double));
-        int64_t count = type == NPY_CDOUBLE ? 2 : 1;
-        for (const int64_t length : shape) count *= length;
-        place = reinterpret_cast<T *>(own->emplace_back(std::max<int64_t>(count, 1)).data());
-    });
-    owner_ = nb::capsule(own.get(), [](void *memory) noexcept { delete static_cast<Memory *>(memory); });
-    own.release();
+    Maker maker{found->type_num, {.blocks = blocks}, {}};
+    require(maker.type == NPY_DOUBLE || maker.type == NPY_CDOUBLE, "engine: a state is of float64 or complex128");
+    Work work{n, maker.type == NPY_CDOUBLE ? 2 * n : n, invariants, stages, balances};
+    work.fields(maker);
     fill(work.sigma, 1.0, work.m);
     for (int64_t i = 0; i < work.l; ++i) work.figures(i)[TERMS] = ENDLESS;
+    // What `Work(*arrays)` does, without its function in Python.
+    return nb::handle(reinterpret_cast<PyObject *>(&PyTuple_Type)).attr("__new__")(work_type, maker.arrays);
 }
 
-Buffers::Buffers(const nb::tuple &state)
-    : Buffers(nb::cast<int64_t>(state[0]), state[1], nb::cast<int64_t>(state[2]), nb::cast<int64_t>(state[3]),
-              nb::cast<int64_t>(state[4]), nb::cast<int64_t>(state[5])) {
-    for (const auto &[name, array] : nb::cast<nb::dict>(state[6]))
-        if (PyArray_CopyInto(nb::borrow<Array>(arrays()[name]).get(), nb::cast<Array>(array).get()) < 0)
-            throw nb::python_error();
-}
-
-nb::tuple Buffers::state() const {
-    return nb::make_tuple(work.n, owned(reinterpret_cast<PyObject *>(PyArray_DescrFromType(type))), work.stages, work.l,
-                          blocks, work.balances, arrays());
-}
-
-const nb::dict &Buffers::arrays(const char *only) const {
-    if (only && arrays_.contains(only)) return arrays_;
-    Work own = work;
-    for_each_buffer(own, blocks, type, [&](const char *name, auto *place, int type, auto shape) {
-        if ((only && std::strcmp(name, only) != 0) || arrays_.contains(name)) return;
-        const std::vector<npy_intp> lengths(shape.begin(), shape.end());
-        arrays_[name] = view(place, static_cast<int>(lengths.size()), lengths.data(), type, owner_);
-    });
-    return arrays_;
-}
-
-const Buffers &buffers_of(nb::handle work) {
-    const Buffers *found = nullptr;
-    if (!nb::try_cast(work, found) || !found) throw nb::type_error("engine: work must be an object of the class Work");
-    return *found;
-}
+}  // namespace
 
 void add_records(nb::module_ &module) {
-    add_record<Span>(module, "Span");
-    add_record<Schedule>(module, "Schedule");
-    add_record<Multistep>(module, "Multistep");
-    add_record<Method>(module, "Method");
-    add_record<Blocks>(module, "Grouping");
-    add_record<Frame>(module, "FrameRows");
-    add_record<Balances>(module, "Balances");
-    add_record<Groups>(module, "Groups");
-    add_record<Columns>(module, "Columns");
-    add_record<Options>(module, "Options");
-    add_record<Members>(module, "Members");
-    add_record<Samples>(module, "Dense");
-    nb::class_<Buffers> type(
-        module, "Work", "Buffers of a run in the engine's memory; each attribute is an array that shows one buffer.");
-    type.def(nb::init<int64_t, nb::handle, int64_t, int64_t, int64_t, int64_t>(), "n"_a, "dtype"_a, "stages"_a,
-             "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0)
-        .def(
-            "arrays", [](const Buffers &own) { return own.arrays(); },
-            nb::sig("def arrays(self) -> dict[str, numpy.typing.NDArray[typing.Any]]"), "Return all arrays by name.")
-        .def("__getstate__", &Buffers::state)
-        .def("__setstate__", [](Buffers &own, const nb::tuple &state) { new (&own) Buffers(state); });
-    Work any{};
-    for_each_buffer(any, 0, NPY_CDOUBLE, [&type](const char *name, auto *, int number, auto) {
-        const char *array = number == NPY_INT64 ? INTEGERS.text : number == NPY_DOUBLE ? FLOATS.text : "numpy.ndarray";
-        const std::string signature = "def " + std::string(name) + "(self, /) -> " + array;
-        type.def_prop_ro(name, [name](const Buffers &own) { return own.array(name); }, nb::sig(signature.c_str()));
-    });
+    const auto add = [&module]<class... Records>(std::tuple<Records...> *) { (add_record<Records>(module), ...); };
+    add(static_cast<std::tuple<Span, Schedule, Multistep, Method, Blocks, Frame, Balances, Groups, Columns, Options,
+                               Members, Samples, Work> *>(nullptr));
+    work_type = nb::object(module.attr("Work"));
+    module.def("new_work", new_work, "n"_a, "dtype"_a, "stages"_a, "n_invariants"_a, "n_blocks"_a, "n_balances"_a = 0,
+               nb::sig("def new_work(n: int, dtype: typing.Any, stages: int, n_invariants: int, n_blocks: int, "
+                       "n_balances: int = 0) -> Work"),
+               "Return the buffers of a run.");
 }
 
 }  // namespace eip

@@ -9,36 +9,16 @@
 
 namespace eip {
 
-// Buffers of a run in the engine's own memory, which is kept alive by the arrays that show it. A complex state has two
-// floats per number.
-class Buffers {
-  public:
-    Buffers(int64_t n, nb::handle dtype, int64_t stages, int64_t invariants, int64_t blocks, int64_t balances);
-
-    Buffers(const Buffers &) = delete;
-    Buffers &operator=(const Buffers &) = delete;
-    // Restores buffers from the value of `state()`, for pickling.
-    explicit Buffers(const nb::tuple &state);
-    nb::tuple state() const;
-
-    // The arrays over the buffers, by name, that were asked for: all of them, or the one of this name.
-    const nb::dict &arrays(const char *only = nullptr) const;
-    Array array(const char *name) const { return nb::borrow<Array>(arrays(name)[name]); }
-
+// The buffers of a run: a record of arrays, which Python reads during the run. A complex state has two floats per number.
+struct Buffers {
+    nb::handle record;
     Work work{};
-    int64_t blocks;
-    int type;
+    int64_t blocks = 0;
+    int type = NPY_DOUBLE;
 
-    // Owner of the memory.
-    nb::handle owner() const { return owner_; }
-
-  private:
-    nb::object owner_;
-    mutable nb::dict arrays_;  // those that were asked for
+    Buffers(nb::handle record, nb::list &kept);
+    Array array(const char *name) const { return nb::borrow<Array>(nb::object(record.attr(name))); }
 };
-
-// Returns the buffers in a Python object of the class Work.
-const Buffers &buffers_of(nb::handle work);
 
 // Objects to which the steps of a run refer.
 struct Data {
@@ -58,11 +38,9 @@ void check_history(const Multistep &multistep);
 Options options_of(nb::handle options, Work &w, int64_t blocks, nb::list &kept);
 Schedule schedule_of(nb::handle schedule, nb::list &kept);
 Samples samples_of(nb::handle dense, const Data &run, int64_t events, int type, nb::list &kept);
-// `rows` are saved of each member.
-Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int64_t rows, int type,
-                   nb::list &kept);
+Members members_of(nb::handle members, const Data &run, const Schedule &schedule, int type, nb::list &kept);
 // Functions of eight members of the run.
-OctetSystem octet_system_of(nb::handle functions, const Data &run);
+BatchFunctions batch_functions_of(nb::handle functions, const Data &run);
 // The balances among the invariants; their rates by pointer are read with the other functions.
 void read_balances(nb::handle functions, const Work &w, System &system);
 // Functions by pointer; `columns` must live as long as the system.
@@ -74,10 +52,7 @@ void require_floats(const char *name, int64_t total, int64_t expected);
 // Attributes of a record.
 double number(const nb::object &object);
 bool truth(const nb::object &object);
-// The memory of an array of this type and shape that may be written to.
-void *memory(nb::handle array, const char *name, int type, Lengths shape, nb::list &kept);
-
-// The records' types and that of the buffers, in the module.
+// The records' types, and the function that makes the buffers of a run, in the module.
 void add_records(nb::module_ &module);
 
 }  // namespace eip

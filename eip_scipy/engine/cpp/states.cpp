@@ -15,16 +15,19 @@ namespace {
 constexpr double INDEPENDENT = 1e-8;
 constexpr int64_t FEW = 24;
 
-using State = StatesOf<const double, 1>;
-using Numbers = ArrayOf<const double, 1>;
-
-// The absolute values of the components of a state, and of those times a factor.
+// A real or complex state, the absolute values of its components, and of those times a factor.
 struct Moduli {
     const double *y;
     int64_t n;
     bool is_complex;
 
-    explicit Moduli(const State &state) : y(state.data), n(state.shape[0]), is_complex(state.type == NPY_CDOUBLE) {}
+    // A state of `length` components, -1 for any number of them.
+    Moduli(nb::handle state, const char *name, int64_t length = -1)
+        : n(length), is_complex(is_plain(state.ptr(), NPY_CDOUBLE, 1)) {
+        const int type = is_complex ? static_cast<int>(NPY_CDOUBLE) : static_cast<int>(NPY_DOUBLE);
+        y = length < 0 ? memory<const double>(state, name, type, Bound{n})
+                       : memory<const double>(state, name, type, length);
+    }
     double operator()(int64_t k, double factor = 1.0) const {
         return is_complex ? std::hypot(factor * y[2 * k], factor * y[2 * k + 1]) : std::abs(factor * y[k]);
     }
@@ -37,16 +40,13 @@ struct Moduli {
     bool is_finite(int64_t k) const { return std::isfinite((*this)(k)); }
 };
 
-void require_pair(const State &y, const State &f) { require(y.shape[0] == f.shape[0], "expected f of the size of y"); }
-
-double time_of_motion(State y, State f) {
-    const double moving = Moduli(f).largest(), size = Moduli(y).largest();
+double time_of_motion(nb::handle y, nb::handle f) {
+    const double moving = Moduli(f, "f").largest(), size = Moduli(y, "y").largest();
     return moving > 0.0 && size > 0.0 ? size / moving : ENDLESS;
 }
 
-Array typical_sizes(State y, State f, double tau) {
-    require_pair(y, f);
-    const Moduli sizes(y), motion(f);
+Array typical_sizes(nb::handle y, nb::handle f, double tau) {
+    const Moduli sizes(y, "y"), motion(f, "f", sizes.n);
     Array out = new_array({sizes.n});
     double *floors = out.floats(), top = 0.0;
     for (int64_t k = 0; k < sizes.n; ++k) {
@@ -59,38 +59,41 @@ Array typical_sizes(State y, State f, double tau) {
     return out;
 }
 
-bool is_canonical(State y, State f) {
-    require_pair(y, f);
-    const int64_t half = y.shape[0] / 2;
-    if (y.shape[0] % 2 != 0 || y.type != NPY_DOUBLE || f.type != NPY_DOUBLE) return false;
-    const double *p = y.data + half, *q_dot = f.data;
+bool is_canonical(nb::handle y, nb::handle f) {
+    const Moduli state(y, "y"), motion(f, "f", state.n);
+    const int64_t half = state.n / 2;
+    if (state.n % 2 != 0 || state.is_complex || motion.is_complex) return false;
+    const double *p = state.y + half, *q_dot = motion.y;
     const auto is_set = [](double a) { return a != 0.0; };
     double along = 0.0;
     for (int64_t k = 0; k < half; ++k) along += is_set(p[k]) ? q_dot[k] * std::copysign(1.0, p[k]) : 0.0 * q_dot[k];
     return std::any_of(q_dot, q_dot + half, is_set) == std::any_of(p, p + half, is_set) && along >= 0.0;
 }
 
-Array states_near(State y, Numbers sizes, ArrayOf<const double, 2> ways) {
-    const int64_t n = y.shape[0], width = y.type == NPY_CDOUBLE ? 2 : 1;
-    require(sizes.shape[0] == n && ways.shape[1] == n, "expected one size and one distance for each component");
-    Array out = new_array({ways.shape[0], n}, y.type);
+Array states_near(nb::handle y, nb::handle sizes, nb::handle ways) {
+    const Moduli start(y, "y");
+    const int64_t n = start.n, width = start.is_complex ? 2 : 1;
+    int64_t count = 0;
+    const auto *size = memory<const double>(sizes, "sizes", NPY_DOUBLE, n);
+    const auto *way = memory<const double>(ways, "ways", NPY_DOUBLE, Bound{count}, n);
+    Array out = new_array({count, n}, start.is_complex ? NPY_CDOUBLE : NPY_DOUBLE);
     double *state = out.floats();
-    for (int64_t i = 0; i < ways.shape[0]; ++i, state += n * width) {
-        const double *way = ways.data + i * n;
-        copy(y.data, state, n * width);
+    for (int64_t i = 0; i < count; ++i, state += n * width, way += n) {
+        copy(start.y, state, n * width);
         for (int64_t k = 0; k < n; ++k) {
             double &shifted = state[k * width];
             const bool is_zero = shifted == 0.0 && (width == 1 || state[2 * k + 1] == 0.0);
-            shifted += (is_zero ? std::abs(way[k]) : way[k]) * sizes.data[k];
+            shifted += (is_zero ? std::abs(way[k]) : way[k]) * size[k];
         }
     }
     return out;
 }
 
 // By a QR decomposition with pivots: the column with the largest remainder is next.
-bool are_independent(ArrayOf<const double, 2> F) {
-    const int64_t m = F.shape[0], n = F.shape[1];
-    if (m < n || n > FEW || !all_finite(F.data, m * n)) return false;
+bool are_independent(nb::handle matrix) {
+    int64_t m = 0, n = 0;
+    const auto *F = memory<const double>(matrix, "F", NPY_DOUBLE, Bound{m}, Bound{n});
+    if (m < n || n > FEW || !all_finite(F, m * n)) return false;
     std::vector<double> columns(m * n);
     const auto scaled = [](double *a, int64_t count, int64_t stride) {
         double top = 0.0;
@@ -98,7 +101,7 @@ bool are_independent(ArrayOf<const double, 2> F) {
         for (int64_t i = 0; i < count && top > 0.0; ++i) a[i * stride] /= top;
     };
     for (int64_t i = 0; i < m; ++i) {
-        for (int64_t k = 0; k < n; ++k) columns[k * m + i] = F.data[i * n + k];
+        for (int64_t k = 0; k < n; ++k) columns[k * m + i] = F[i * n + k];
         scaled(columns.data() + i, n, m);
     }
     for (int64_t k = 0; k < n; ++k) scaled(columns.data() + k * m, m, 1);
@@ -121,12 +124,13 @@ bool are_independent(ArrayOf<const double, 2> F) {
     return true;
 }
 
-void raise_residuals(ArrayOf<double, 1> largest, ArrayOf<const double, 2> values, Numbers target) {
-    const int64_t l = largest.shape[0];
-    require(values.shape[1] == l && target.shape[0] == l, "expected one number for each value of the invariants");
-    for (int64_t i = 0; i < values.shape[0]; ++i)
-        for (int64_t k = 0; k < l; ++k)
-            largest.data[k] = std::fmax(largest.data[k], std::abs(values.data[i * l + k] - target.data[k]));
+void raise_residuals(nb::handle largest, nb::handle values, nb::handle target) {
+    int64_t l = 0, rows = 0;
+    auto *most = memory<double>(largest, "largest", NPY_DOUBLE, Bound{l});
+    const auto *value = memory<const double>(values, "values", NPY_DOUBLE, Bound{rows}, l);
+    const auto *targets = memory<const double>(target, "target", NPY_DOUBLE, l);
+    for (int64_t i = 0; i < rows; ++i)
+        for (int64_t k = 0; k < l; ++k) most[k] = std::fmax(most[k], std::abs(value[i * l + k] - targets[k]));
 }
 
 }  // namespace

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-#include "octet.hpp"
+#include "lanes8.hpp"
 
 namespace eip {
 

@@ -7,7 +7,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "octet.hpp"
+#include "lanes8.hpp"
 
 namespace eip {
 
@@ -43,28 +43,28 @@ inline double power(double x, double exponent) {
 inline bool any(bool condition) { return condition; }
 inline bool any(const Mask &mask) { return mask.any(); }
 
-inline Octet power(const Octet &x, double exponent) {
+inline Lanes8 power(const Lanes8 &x, double exponent) {
     double lanes[LANES];
     x.store(lanes);
     for (double &lane : lanes) lane = power(lane, exponent);
-    return Octet::load(lanes);
+    return Lanes8::load(lanes);
 }
 
 // Operand of the sums of sums.hpp instead of a float: a vector, whose lanes are added in the same order.
 template <class Value>
-inline const Value &load_as(const Octet *a) {
+inline const Value &load_as(const Lanes8 *a) {
     return *a;
 }
 template <class Value>
-inline const Value &load_alone(const Octet *a) {
+inline const Value &load_alone(const Lanes8 *a) {
     return *a;
 }
-inline void store_as(const Octet &x, Octet *a) { *a = x; }
+inline void store_as(const Lanes8 &x, Lanes8 *a) { *a = x; }
 template <class Value>
-inline const Octet &spread(const Octet &x) {
+inline const Lanes8 &spread(const Lanes8 &x) {
     return x;
 }
-inline Octet absolute(const Octet &x) { return abs(x); }
+inline Lanes8 absolute(const Lanes8 &x) { return abs(x); }
 
 // in_blocks of the entries of an array: floats in vectors, and vectors one by one. The pointer says which.
 template <class Part>
@@ -72,24 +72,24 @@ template <class Part>
     in_blocks(n, part);
 }
 template <class Part>
-[[gnu::always_inline]] inline void in_blocks(const Octet *, int64_t n, const Part &part) {
-    for (int64_t i = 0; i < n; ++i) part.template operator()<Octet, 1>(i);
+[[gnu::always_inline]] inline void in_blocks(const Lanes8 *, int64_t n, const Part &part) {
+    for (int64_t i = 0; i < n; ++i) part.template operator()<Lanes8, 1>(i);
 }
 
 template <class Term>
-inline Octet sum_of(const Octet *, int64_t n, const Term &term) {
+inline Lanes8 sum_of(const Lanes8 *, int64_t n, const Term &term) {
     const int64_t whole = n - n % LANES;
-    Octet rest(0.0);
-    for (int64_t i = whole; i < n; ++i) rest += term.template operator()<Octet>(i);
+    Lanes8 rest(0.0);
+    for (int64_t i = whole; i < n; ++i) rest += term.template operator()<Lanes8>(i);
     if (whole == 0) return rest;
-    Octet sums[LANES];
-    for (Octet &sum : sums) sum = 0.0;
+    Lanes8 sums[LANES];
+    for (Lanes8 &sum : sums) sum = 0.0;
     for (int64_t i = 0; i < whole; i += LANES)
-        for (int k = 0; k < LANES; ++k) sums[k] += term.template operator()<Octet>(i + k);
+        for (int k = 0; k < LANES; ++k) sums[k] += term.template operator()<Lanes8>(i + k);
     return ((sums[0] + sums[4]) + (sums[2] + sums[6])) + ((sums[1] + sums[5]) + (sums[3] + sums[7])) + rest;
 }
 
-inline AbsDots<Octet> abs_dots(const Octet *a, const Octet *b, const Octet *c, int64_t n) {
+inline AbsDots<Lanes8> abs_dots(const Lanes8 *a, const Lanes8 *b, const Lanes8 *c, int64_t n) {
     return {abs_dot(a, b, n), abs_dot(a, c, n)};
 }
 
@@ -102,8 +102,8 @@ inline Value largest(const Value *a, int64_t n) {
 }
 
 // True if the sum of squares is finite: of a state so large that it overflows this says no.
-inline Mask all_finite(const Octet *a, int64_t n) {
-    const Octet square = dot(a, a, n);
+inline Mask all_finite(const Lanes8 *a, int64_t n) {
+    const Lanes8 square = dot(a, a, n);
     return square - square == 0.0;
 }
 
@@ -113,7 +113,7 @@ inline Value *as_values(double *a) {
     return reinterpret_cast<Value *>(a);
 }
 inline double *as_floats(double *a) { return a; }
-inline double *as_floats(Octet *a) { return reinterpret_cast<double *>(a); }
+inline double *as_floats(Lanes8 *a) { return reinterpret_cast<double *>(a); }
 
 // x, or 1 in place of 0: a divisor where the quotient does not count.
 template <class Value>

@@ -6,10 +6,54 @@
 
 #include <nanobind/stl/array.h>
 
+#include <optional>
+
 #include "../sums.hpp"
 
 namespace eip {
 namespace {
+
+// An array argument with any number of axes, of floats or, if COMPLEX, of complex numbers. `columns` is the length of its last
+// axis.
+template <class T, bool COMPLEX>
+struct PointsOf {
+    static constexpr auto TEXT = nb::detail::const_name<COMPLEX>("numpy.typing.NDArray[numpy.complex128]",
+                                                                 "numpy.typing.NDArray[numpy.float64]");
+    T *data;
+    npy_intp points, columns;
+
+    operator PointsOf<const T, COMPLEX>() const { return {data, points, columns}; }
+
+    bool take(PyObject *object) {
+        auto *array = reinterpret_cast<PyArrayObject *>(object);
+        if (!PyArray_Check(object) || PyArray_TYPE(array) != (COMPLEX ? NPY_CDOUBLE : NPY_DOUBLE)) return false;
+        if (PyArray_NDIM(array) == 0 || !PyArray_ISCARRAY_RO(array)) return false;
+        data = static_cast<T *>(PyArray_DATA(array));
+        points = PyArray_SIZE(array);
+        columns = PyArray_DIM(array, PyArray_NDIM(array) - 1);
+        return std::is_const_v<T> || PyArray_ISWRITEABLE(array);
+    }
+};
+
+using Field = PointsOf<double, true>;
+using ConstField = PointsOf<const double, true>;
+using ConstReals = PointsOf<const double, false>;
+
+template <class First, class... Others>
+void require_one_length(const First &first, const Others &...others) {
+    require(((first.points == others.points) && ...), "expected arrays with the same number of points");
+}
+
+// Lets other threads run while a large array is worked on.
+class [[maybe_unused]] Released {
+  public:
+    explicit Released(npy_intp points) {
+        if (points >= 1 << 14) released_.emplace();
+    }
+
+  private:
+    std::optional<WithoutLock> released_;
+};
 
 constexpr npy_intp BLOCK = 512;  // floats
 
@@ -248,6 +292,20 @@ double weighted_square(ConstField field, ConstReals weight) {
 }
 
 }  // namespace
+}  // namespace eip
+
+namespace nanobind::detail {
+
+template <class T, bool COMPLEX>
+struct type_caster<eip::PointsOf<T, COMPLEX>> {
+    using Points = eip::PointsOf<T, COMPLEX>;
+    NB_TYPE_CASTER(Points, Points::TEXT)
+    bool from_python(handle object, uint32_t, cleanup_list *) noexcept { return value.take(object.ptr()); }
+};
+
+}  // namespace nanobind::detail
+
+namespace eip {
 
 void add_condensates(Module module) {
     module.def("multiply", multiply, "field"_a, "factor"_a);

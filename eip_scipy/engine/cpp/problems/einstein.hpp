@@ -12,29 +12,12 @@
 // 1/c^4. What is computed is G times energy and momenta.
 #pragma once
 
-#include <array>
 #include <vector>
 
+#include "duals.hpp"
 #include "newton.hpp"
 
 namespace eip {
-
-using Three = std::array<double, 3>;
-
-inline double dot(const Three &a, const Three &b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-inline Three cross(const Three &a, const Three &b) {
-    return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
-}
-inline Three body(const double *vectors, int64_t i) { return {vectors[3 * i], vectors[3 * i + 1], vectors[3 * i + 2]}; }
-// s a + t b.
-inline Three sum(double s, const Three &a, double t, const Three &b) {
-    return {s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]};
-}
-inline Three operator-(const Three &a, const Three &b) { return {a[0] - b[0], a[1] - b[1], a[2] - b[2]}; }
-inline Three operator-(const Three &a) { return {-a[0], -a[1], -a[2]}; }
-inline void add(double *out, int64_t i, double s, const Three &a) {
-    for (int c = 0; c < 3; ++c) out[3 * i + c] += s * a[c];
-}
 
 // Three columns of a matrix (3, n).
 struct ThreeColumns {
@@ -61,12 +44,14 @@ struct ThreeColumns {
 };
 
 // Bodies to this order: `over_c2` is 1/c^2.
+template <class T>
 struct Einstein {
-    const double *q, *v, *gm;
+    const T *q, *v;
+    const double *gm;
     int64_t n;
     double over_c2;
 
-    Einstein(const double *y, const double *gm, int64_t bodies, double over_c2)
+    Einstein(const T *y, const double *gm, int64_t bodies, double over_c2)
         : q(y),
           v(y + 3 * bodies),
           gm(gm),
@@ -74,12 +59,13 @@ struct Einstein {
           over_c2(over_c2) {}
 
     // The sum of G m / r over the other bodies, at each.
-    std::vector<double> potentials() const {
-        std::vector<double> phi(n);
+    std::vector<T> potentials() const {
+        using std::sqrt;
+        std::vector<T> phi(n);
         for (int64_t i = 0; i < n; ++i)
             for (int64_t j = i + 1; j < n; ++j) {
-                const Three x = body(q, i) - body(q, j);
-                const double u = 1.0 / std::sqrt(dot(x, x));
+                const Vec3<T> x = body(q, i) - body(q, j);
+                const T u = 1.0 / sqrt(dot(x, x));
                 phi[i] += gm[j] * u;
                 phi[j] += gm[i] * u;
             }
@@ -87,44 +73,15 @@ struct Einstein {
     }
 
     // Add the terms in 1/c^2 to out (3 N), which holds Newton's accelerations.
-    void add_accelerations(double *out) const {
-        const std::vector<double> newton(out, out + 3 * n), phi = potentials();
+    void add_accelerations(T *out) const {
+        using std::sqrt;
+        const std::vector<T> newton(out, out + 3 * n), phi = potentials();
         for (int64_t i = 0; i < n; ++i)
             for (int64_t j = i + 1; j < n; ++j) {
-                const Three x = body(q, i) - body(q, j);
-                const double u = 1.0 / std::sqrt(dot(x, x));
-                Pull(*this, i, j, x, u, phi, newton.data()).add(out);
-                Pull(*this, j, i, -x, u, phi, newton.data()).add(out);
-            }
-    }
-
-    // Add the derivatives of these terms along `count` columns (dq, dv) of 6 N numbers. The same columns of `out` hold
-    // those of Newton's accelerations in their second halves; `newton` (3 N) are the accelerations themselves.
-    void add_slopes(const double *newton, const double *columns, int64_t count, double *out) const {
-        const int64_t half = 3 * n, size = 6 * n;
-        const std::vector<double> phi = potentials();
-        std::vector<double> by_phi(count * n), by_newton(count * half);
-        for (int64_t k = 0; k < count; ++k)
-            std::copy(out + size * k + half, out + size * (k + 1), by_newton.begin() + half * k);
-        for (int64_t i = 0; i < n; ++i)
-            for (int64_t j = i + 1; j < n; ++j) {
-                const Three x = body(q, i) - body(q, j);
-                const double u2 = 1.0 / dot(x, x), u3 = u2 * std::sqrt(u2);
-                for (int64_t k = 0; k < count; ++k) {
-                    const double *column = columns + size * k, du = -u3 * dot(x, body(column, i) - body(column, j));
-                    by_phi[n * k + i] += gm[j] * du;
-                    by_phi[n * k + j] += gm[i] * du;
-                }
-            }
-        for (int64_t i = 0; i < n; ++i)
-            for (int64_t j = 0; j < n; ++j) {
-                if (j == i) continue;
-                const Three x = body(q, i) - body(q, j);
-                const Pull pull(*this, i, j, x, 1.0 / std::sqrt(dot(x, x)), phi, newton);
-                for (int64_t k = 0; k < count; ++k) {
-                    const double *slopes = by_phi.data() + n * k, *accelerations = by_newton.data() + half * k;
-                    pull.add(columns + size * k, 4.0 * slopes[i] + slopes[j], accelerations, out + size * k + half);
-                }
+                const Vec3<T> x = body(q, i) - body(q, j);
+                const T u = 1.0 / sqrt(dot(x, x));
+                add_pull(i, j, x, u, phi, newton.data(), out);
+                add_pull(j, i, -x, u, phi, newton.data(), out);
             }
     }
 
@@ -209,51 +166,20 @@ struct Einstein {
     ThreeColumns by_position(double *out, int64_t i) const { return {out + 3 * i, 6 * n}; }
     ThreeColumns by_velocity(double *out, int64_t i) const { return {out + 3 * (n + i), 6 * n}; }
 
-    // Body j's pull on body i, and what its derivative takes that does not depend on the direction; x from j to i, u = 1/r.
-    struct Pull {
-        int64_t i, j, n;
-        Three x, vi, vj, aj;
-        double u, radial, along, across, mass, w, w3;
-
-        Pull(const Einstein &all, int64_t i, int64_t j, const Three &x, double u, const std::vector<double> &phi,
-             const double *newton)
-            : i(i),
-              j(j),
-              n(all.n),
-              x(x),
-              vi(body(all.v, i)),
-              vj(body(all.v, j)),
-              aj(body(newton, j)),
-              u(u) {
-            radial = dot(x, vj) * u;
-            along = 4.0 * phi[i] + phi[j] - dot(vi, vi) - 2.0 * dot(vj, vj) + 4.0 * dot(vi, vj);
-            along += 1.5 * radial * radial + 0.5 * dot(x, aj);
-            across = 4.0 * dot(x, vi) - 3.0 * dot(x, vj);
-            mass = all.over_c2 * all.gm[j];
-            w = mass * u;
-            w3 = w * u * u;
-        }
-
-        void add(double *out) const {
-            eip::add(out, i, w3 * along, x);
-            eip::add(out, i, w3 * across, vi - vj);
-            eip::add(out, i, 3.5 * mass * u, aj);
-        }
-
-        // Change along a column (dq, dv): what it adds to 4 phi_i + phi_j, and what it adds to Newton's accelerations.
-        void add(const double *column, double by_phi, const double *by_newton, double *out) const {
-            const Three dx = body(column, i) - body(column, j), da = body(by_newton, j);
-            const Three di = body(column, n + i), dj = body(column, n + j);
-            const double e = dot(x, dx) * u * u;  // of a power of u the derivative has -e times it
-            const double by_radial = (dot(dx, vj) + dot(x, dj)) * u - e * radial;
-            double by_along = by_phi - 2.0 * dot(vi, di) - 4.0 * dot(vj, dj) + 4.0 * (dot(di, vj) + dot(vi, dj));
-            by_along += 3.0 * radial * by_radial + 0.5 * (dot(dx, aj) + dot(x, da));
-            const double by_across = 4.0 * (dot(dx, vi) + dot(x, di)) - 3.0 * (dot(dx, vj) + dot(x, dj));
-            eip::add(out, i, w3, sum(by_along - 3.0 * e * along, x, along, dx));
-            eip::add(out, i, w3, sum(by_across - 3.0 * e * across, vi - vj, across, di - dj));
-            eip::add(out, i, 3.5 * w, sum(1.0, da, -e, aj));
-        }
-    };
+    // Add body j's pull on body i; x from j to i, u = 1/r.
+    void add_pull(int64_t i, int64_t j, const Vec3<T> &x, const T &u, const std::vector<T> &phi, const T *newton,
+                  T *out) const {
+        const Vec3<T> vi = body(v, i), vj = body(v, j), aj = body(newton, j);
+        const T radial = dot(x, vj) * u;
+        T along = 4.0 * phi[i] + phi[j] - dot(vi, vi) - 2.0 * dot(vj, vj) + 4.0 * dot(vi, vj);
+        along += 1.5 * radial * radial + 0.5 * dot(x, aj);
+        const T across = 4.0 * dot(x, vi) - 3.0 * dot(x, vj);
+        const double mass = over_c2 * gm[j];
+        const T w = mass * u, w3 = w * u * u;
+        add(out, i, w3 * along, x);
+        add(out, i, w3 * across, vi - vj);
+        add(out, i, 3.5 * mass * u, aj);
+    }
 
     // Force that pulls body j towards i, as in the energy.
     Three pair_force(int64_t i, int64_t j, double phi) const {

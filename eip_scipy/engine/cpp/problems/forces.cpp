@@ -1,4 +1,5 @@
 // N bodies with further forces. After every G m the parameters hold the entries of forces.py.
+#include <algorithm>
 #include <cmath>
 
 #include "einstein.hpp"
@@ -16,19 +17,30 @@ struct Bodies {
     const double *gm, *k;
 
     explicit Bodies(const Given<double> &g) : n(g.p - N_ENTRIES), gm(g.params), k(g.params + n) {}
-    Three pole() const { return {k[POLE], k[POLE + 1], k[POLE + 2]}; }
-    Einstein einstein(const double *y) const { return {y, gm, n, k[OVER_C2]}; }
+    template <class T = double>
+    Vec3<T> pole() const {
+        return {k[POLE], k[POLE + 1], k[POLE + 2]};
+    }
+    template <class T>
+    Einstein<T> einstein(const T *y) const {
+        return {y, gm, n, k[OVER_C2]};
+    }
 };
 
+using std::exp;
+using std::sqrt;
+
 // Acceleration of body i at x from the Sun by the terms that depend on positions.
-Three pull(const Three &x, const Bodies &b, int64_t i) {
-    const double gm_sun = b.gm[0], r2 = dot(x, x);
-    double w = 0.0, along = 0.0;
+template <class T>
+Vec3<T> pull(const Vec3<T> &x, const Bodies &b, int64_t i) {
+    const double gm_sun = b.gm[0];
+    const T r2 = dot(x, x);
+    T w = 0.0, along = 0.0;
     if (b.k[KIND] == POTENTIAL) w += 6.0 * gm_sun * gm_sun * b.k[OVER_C2] / (r2 * r2);
-    if (b.k[MOON_BODY] == i) w += 3.0 * gm_sun * b.k[MOON] / (r2 * r2 * std::sqrt(r2));
-    const Three pole = b.pole();
+    if (b.k[MOON_BODY] == i) w += 3.0 * gm_sun * b.k[MOON] / (r2 * r2 * sqrt(r2));
+    const Vec3<T> pole = b.pole<T>();
     if (b.k[OBLATENESS] > 0.0) {
-        const double s = dot(x, pole), u = 1.5 * gm_sun * b.k[OBLATENESS] / (r2 * r2 * std::sqrt(r2));
+        const T s = dot(x, pole), u = 1.5 * gm_sun * b.k[OBLATENESS] / (r2 * r2 * sqrt(r2));
         w += u * (1.0 - 5.0 * s * s / r2);
         along = 2.0 * u * s;
     }
@@ -36,26 +48,30 @@ Three pull(const Three &x, const Bodies &b, int64_t i) {
 }
 
 // The Sun's first post-Newtonian pull on a body at x with the velocity v, both relative.
-Three pull_1pn(const Three &x, const Three &v, const Bodies &b) {
-    const double gm_sun = b.gm[0], r2 = dot(x, x), r = std::sqrt(r2), w = gm_sun * b.k[OVER_C2] / (r2 * r);
+template <class T>
+Vec3<T> pull_1pn(const Vec3<T> &x, const Vec3<T> &v, const Bodies &b) {
+    const double gm_sun = b.gm[0];
+    const T r2 = dot(x, x), r = sqrt(r2), w = gm_sun * b.k[OVER_C2] / (r2 * r);
     return sum(w * (4.0 * gm_sun / r - dot(v, v)), x, 4.0 * w * dot(x, v), v);
 }
 
 // Drag on a body at x with the velocity v, both relative, by air that turns about the pole and whose density falls by e
 // in each scale height.
-Three drag(const Three &x, const Three &v, const Bodies &b) {
-    const Three u = sum(1.0, v, -b.k[SPIN], cross(b.pole(), x));
-    const double height = std::sqrt(dot(x, x)) - b.k[BASE];
-    const double w = -b.k[DRAG] * std::exp(-height / b.k[SCALE_HEIGHT]) * std::sqrt(dot(u, u));
+template <class T>
+Vec3<T> drag(const Vec3<T> &x, const Vec3<T> &v, const Bodies &b) {
+    const Vec3<T> u = sum(1.0, v, -b.k[SPIN], cross(b.pole<T>(), x));
+    const T height = sqrt(dot(x, x)) - b.k[BASE];
+    const T w = -b.k[DRAG] * exp(-height / b.k[SCALE_HEIGHT]) * sqrt(dot(u, u));
     return {w * u[0], w * u[1], w * u[2]};
 }
 
 // Add to out (3 N) the Sun's further forces on all others, and their reactions on it; v is null where none depends on it.
-void add_pulls(const double *q, const double *v, const Bodies &b, double *out) {
-    Three back{};
+template <class T>
+void add_pulls(const T *q, const T *v, const Bodies &b, T *out) {
+    Vec3<T> back{};
     for (int64_t i = 1; i < b.n; ++i) {
-        const Three x = body(q, i) - body(q, 0);
-        Three a = pull(x, b, i);
+        const Vec3<T> x = body(q, i) - body(q, 0);
+        Vec3<T> a = pull(x, b, i);
         if (v && b.k[KIND] == ONE_PN) a = sum(1.0, a, 1.0, pull_1pn(x, body(v, i) - body(v, 0), b));
         if (v && b.k[DRAG] > 0.0) a = sum(1.0, a, 1.0, drag(x, body(v, i) - body(v, 0), b));
         add(out, i, 1.0, a);
@@ -76,94 +92,30 @@ void rhs(const Given<double> &g) {
 void acc(const Given<double> &g) {
     const Bodies b(g);
     accelerate(g.y, b.gm, b.n, g.out);
-    add_pulls(g.y, nullptr, b, g.out);
+    add_pulls<double>(g.y, nullptr, b, g.out);
 }
 
-// The derivatives of `pull` and `pull_1pn` on body i, with what does not depend on the direction.
-struct PullSlope {
-    Three x, v, pole;
-    double over_r2, potential = 0.0, moon = 0.0, oblate = 0.0, sine, relativity = 0.0, four, even, odd;
-
-    PullSlope(const double *y, const Bodies &b, int64_t i)
-        : x(body(y, i) - body(y, 0)),
-          v(body(y, b.n + i) - body(y, b.n)),
-          pole(b.pole()),
-          sine(dot(x, pole)),
-          odd(dot(x, v)) {
-        const double gm_sun = b.gm[0], r2 = dot(x, x), over_r = 1.0 / std::sqrt(r2);
-        over_r2 = 1.0 / r2;
-        const double over_r3 = over_r * over_r2, over_r5 = over_r3 * over_r2;
-        four = 4.0 * gm_sun * over_r;
-        even = four - dot(v, v);
-        if (b.k[KIND] == POTENTIAL) potential = 6.0 * gm_sun * gm_sun * b.k[OVER_C2] * over_r2 * over_r2;
-        if (b.k[KIND] == ONE_PN) relativity = gm_sun * b.k[OVER_C2] * over_r3;
-        if (b.k[MOON_BODY] == i) moon = 3.0 * gm_sun * b.k[MOON] * over_r5;
-        if (b.k[OBLATENESS] > 0.0) oblate = 1.5 * gm_sun * b.k[OBLATENESS] * over_r5;
-    }
-
-    // Along (dx, dv).
-    Three along(const Three &dx, const Three &dv) const {
-        const double e = dot(x, dx) * over_r2;  // of a power of 1/r the derivative has -e times it
-        const double ratio = 5.0 * sine * sine * over_r2, by_sine = dot(dx, pole);
-        double by_x = e * (4.0 * potential + 5.0 * moon), by_dx = -potential - moon - oblate * (1.0 - ratio);
-        by_x += oblate * (5.0 * e * (1.0 - ratio) + 10.0 * sine * by_sine * over_r2 - 2.0 * e * ratio);
-        const Three still = sum(by_x, x, by_dx, dx);
-        const Three newtonian = sum(1.0, still, -2.0 * oblate * (by_sine - 5.0 * e * sine), pole);
-        if (relativity == 0.0) return newtonian;
-        const double by_even = -e * four - 2.0 * dot(v, dv);
-        const double by_odd = dot(dx, v) + dot(x, dv);
-        const Three along_x = sum(by_even - 3.0 * e * even, x, even, dx);
-        const Three along_v = sum(4.0 * (by_odd - 3.0 * e * odd), v, 4.0 * odd, dv);
-        return sum(1.0, newtonian, relativity, sum(1.0, along_x, 1.0, along_v));
-    }
-};
-
-// The derivative of `drag` on body i; a body that moves with the air has none.
-struct DragSlope {
-    Three x, u, turn;
-    double over_square = 0.0, density = 0.0, falls = 0.0;
-
-    DragSlope() = default;
-    DragSlope(const double *y, const Bodies &b, int64_t i)
-        : x(body(y, i) - body(y, 0)),
-          turn(sum(b.k[SPIN], b.pole(), 0.0, x)) {
-        u = sum(1.0, body(y, b.n + i) - body(y, b.n), -1.0, cross(turn, x));
-        const double r = std::sqrt(dot(x, x)), square = dot(u, u);
-        falls = 1.0 / (b.k[SCALE_HEIGHT] * r);
-        if (square == 0.0) return;
-        density = -b.k[DRAG] * std::exp(-(r - b.k[BASE]) / b.k[SCALE_HEIGHT]) * std::sqrt(square);
-        over_square = 1.0 / square;
-    }
-
-    // Along (dx, dv).
-    Three along(const Three &dx, const Three &dv) const {
-        const Three du = sum(1.0, dv, -1.0, cross(turn, dx));
-        return sum(density * (dot(u, du) * over_square - dot(x, dx) * falls), u, density, du);
-    }
-};
-
-// For a state followed by columns of derivatives: the derivatives first, which need Newton's accelerations.
+// For a state followed by columns of derivatives, eight of which are found at once; the last one may stand in several lanes.
 void variational(const Given<double> &g) {
     const Bodies b(g);
-    const int64_t size = 6 * b.n, columns = g.n / size - 1;
-    double *a = g.out + 3 * b.n;
+    const int64_t size = 6 * b.n, half = 3 * b.n, columns = g.n / size - 1;
     newton_variational(g.y, b.gm, b.n, columns, g.out);
-    if (b.k[KIND] == EIH) {
-        b.einstein(g.y).add_slopes(a, g.y + size, columns, g.out + size);
-        b.einstein(g.y).add_accelerations(a);
-    }
-    add_pulls(g.y, g.y + 3 * b.n, b, a);
-    for (int64_t i = 1; i < b.n; ++i) {
-        const PullSlope pull(g.y, b, i);
-        const bool drags = b.k[DRAG] > 0.0;
-        const DragSlope drag = drags ? DragSlope(g.y, b, i) : DragSlope();
-        for (int64_t k = 1; k <= columns; ++k) {
-            const double *q = g.y + size * k, *v = q + 3 * b.n;
-            const Three dx = body(q, i) - body(q, 0), dv = body(v, i) - body(v, 0);
-            Three slope = pull.along(dx, dv);
-            if (drags) slope = sum(1.0, slope, 1.0, drag.along(dx, dv));
-            add(a + size * k, i, 1.0, slope);
-            add(a + size * k, 0, -b.gm[i] / b.gm[0], slope);
+    std::vector<Dual> y(size), a(half);
+    const std::vector<double> newton(g.out + half, g.out + size);
+    for (int64_t first = 1; first <= std::max<int64_t>(columns, 1); first += LANES) {
+        const auto slopes = [&](const double *numbers) {
+            double lanes[LANES];
+            for (int64_t k = 0; k < LANES; ++k) lanes[k] = numbers[size * std::min(first + k, columns)];
+            return Lanes8::load(lanes);
+        };
+        for (int64_t i = 0; i < size; ++i) y[i] = {g.y[i], slopes(g.y + i)};
+        for (int64_t i = 0; i < half; ++i) a[i] = {newton[i], slopes(g.out + half + i)};
+        if (b.k[KIND] == EIH) b.einstein(y.data()).add_accelerations(a.data());
+        add_pulls<Dual>(y.data(), y.data() + half, b, a.data());
+        for (int64_t i = 0; i < half; ++i) {
+            g.out[half + i] = a[i].value;
+            for (int64_t k = 0; k < LANES && first + k <= columns; ++k)
+                g.out[size * (first + k) + half + i] = a[i].slope.lane(static_cast<int>(k));
         }
     }
 }
@@ -227,7 +179,7 @@ void eih_energy_gradient(const Given<double> &g) {
     const Bodies b(g);
     b.einstein(g.y).energy_gradient(g.out);
     std::vector<double> pulls(3 * b.n);
-    add_pulls(g.y, nullptr, b, pulls.data());
+    add_pulls<double>(g.y, nullptr, b, pulls.data());
     for (int64_t i = 0; i < 3 * b.n; ++i) g.out[i] -= b.gm[i / 3] * pulls[i];
 }
 

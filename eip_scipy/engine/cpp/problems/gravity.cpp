@@ -58,8 +58,8 @@ constexpr const char *COLUMNS =
 constexpr const char *BODIES = "positions and velocities, 6 numbers per body, and G m of every body as parameters";
 constexpr const char *POSITIONS = "positions, 3 numbers per body, and G m of every body as parameters";
 
-#define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
-#define EIP_OF_BODIES(function) plain<double, of_bodies<double, function>>, plain<Octet, of_bodies<Octet, function>>
+#define EIP_BOTH(function) plain<double, function<double>>, plain<Lanes8, function<Lanes8>>
+#define EIP_OF_BODIES(function) plain<double, of_bodies<double, function>>, plain<Lanes8, of_bodies<Lanes8, function>>
 const LibraryFunction functions[] = {
     {"gravity.rhs", Value::DERIVATIVE, 0, EIP_OF_BODIES(newton_rhs), in_phase_space, BODIES, rhs_apart, nullptr,
      nullptr, &RHS_WITH_ENERGY},

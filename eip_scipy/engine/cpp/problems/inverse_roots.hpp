@@ -6,7 +6,7 @@
 
 #include <limits>
 
-#include "../octet.hpp"
+#include "../lanes8.hpp"
 
 namespace eip {
 
@@ -37,39 +37,39 @@ inline Vector over_root(Vector x) {
     return over_root(x, y, y2, fused(-x, y2, spread_vector(1.0)));
 }
 
-inline Octet over_root(const Octet &x) {
-    Octet out;
+inline Lanes8 over_root(const Lanes8 &x) {
+    Lanes8 out;
     for (int v = 0; v < VECTORS; ++v) out.part[v] = over_root(x.part[v]);
     return out;
 }
 
 // Parts of x^-3/2 shared by the two bodies of a pair: y and y^2 for y near x^-1/2, h = 1 - x y^2, and 3/2 + 15/8 h.
 struct Cube {
-    Octet y, y2, h, p;
+    Lanes8 y, y2, h, p;
 
-    explicit Cube(const Octet &x) {
+    explicit Cube(const Lanes8 &x) {
         for (int v = 0; v < VECTORS; ++v) y.part[v] = root_estimate(x.part[v]);
         y2 = y * y;
         h = multiply_add(-x, y2, 1.0);
-        p = multiply_add(Octet(15.0 / 8.0), h, Octet(3.0 / 2.0));
+        p = multiply_add(Lanes8(15.0 / 8.0), h, Lanes8(3.0 / 2.0));
     }
 
     // m x^-3/2 = m y^3 (1 + 3/2 h + 15/8 h^2).
-    Octet times(const Octet &m) const {
-        const Octet w = m * y * y2;
+    Lanes8 times(const Lanes8 &m) const {
+        const Lanes8 w = m * y * y2;
         return multiply_add(w * h, p, w);
     }
 
     // x^-1/2 as by `over_root`.
-    Octet root(const Octet &x) const {
-        Octet out;
+    Lanes8 root(const Lanes8 &x) const {
+        Lanes8 out;
         for (int v = 0; v < VECTORS; ++v) out.part[v] = over_root(x.part[v], y.part[v], y2.part[v], h.part[v]);
         return out;
     }
 
     // x^-3/2, for products with both masses of a pair.
-    Octet alone() const {
-        const Octet w = y * y2;
+    Lanes8 alone() const {
+        const Lanes8 w = y * y2;
         return multiply_add(w * h, p, w);
     }
 };

@@ -170,7 +170,7 @@ constexpr const char *FOURS = "a state of 4 numbers, columns of 4 numbers, and 1
 constexpr const char *TWOS = "a state of 2 numbers, columns of 2 numbers, and 1 parameter";
 constexpr const char *FOUR = "a state of 4 numbers and 1 parameter", *TWO = "2 numbers and 1 parameter";
 
-#define EIP_BOTH(function) plain<double, function<double>>, plain<Octet, function<Octet>>
+#define EIP_BOTH(function) plain<double, function<double>>, plain<Lanes8, function<Lanes8>>
 #define EIP_VARIATIONAL(function, by_parameter, size, sizes) \
     Value::DERIVATIVE, 0, plain<double, function<by_parameter>>, nullptr, with_columns<size, by_parameter>, sizes
 const LibraryFunction functions[] = {

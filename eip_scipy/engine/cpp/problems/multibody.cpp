@@ -18,7 +18,7 @@ namespace {
 
 // Pivots of the mass matrix on the null space, its rows and columns scaled to a largest element of 1, that count as 0.
 constexpr double SINGULAR_MASS = 1e-13;
-constexpr int64_t MASS_IS_SINGULAR = -1, NOT_FINITE = -2, OUT_OF_MEMORY = -3;
+constexpr int64_t MASS_IS_SINGULAR = -1, NAN_IN_MATRICES = -2, OUT_OF_MEMORY = -3;
 
 // A reflection 1 - factor v v^T, where v is a first element and others that lie elsewhere.
 struct Reflection {
@@ -68,9 +68,9 @@ class Motion {
         right_ = left_ + std::min(m, n);
     }
 
-    // Returns the rank of the constraints, or MASS_IS_SINGULAR or NOT_FINITE. `multipliers` may be null.
+    // Returns the rank of the constraints, or MASS_IS_SINGULAR or NAN_IN_MATRICES. `multipliers` may be null.
     int64_t solve(double tolerance, double *acceleration, double *multipliers) {
-        if (!all_finite(M_, n_ * n_ + n_ + m_ * n_ + m_)) return NOT_FINITE;
+        if (!all_finite(M_, n_ * n_ + n_ + m_ * n_ + m_)) return NAN_IN_MATRICES;
         factor_gradients(tolerance);
         make_square();
         solve_constraints();
@@ -256,7 +256,7 @@ void add_multibody(Module module) {
         "solve_address", [] { return reinterpret_cast<uintptr_t>(solve); },
         "Return the address of `solve` in multibody.cpp, for compiled code.");
     module.attr("MASS_IS_SINGULAR") = MASS_IS_SINGULAR;
-    module.attr("NOT_FINITE") = NOT_FINITE;
+    module.attr("NOT_FINITE") = NAN_IN_MATRICES;
 }
 
 }  // namespace eip

@@ -68,7 +68,7 @@ inline void central_one_by_one(const T *q, const T *dq, const T *gm, int64_t bod
     }
 }
 
-inline void central_jacobian(const Octet *q, const Octet *dq, const Octet *gm, int64_t bodies, Octet *out) {
+inline void central_jacobian(const Lanes8 *q, const Lanes8 *dq, const Lanes8 *gm, int64_t bodies, Lanes8 *out) {
     central_one_by_one(q, dq, gm, bodies, out);
 }
 

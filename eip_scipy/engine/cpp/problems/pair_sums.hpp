@@ -22,6 +22,7 @@
 #include <vector>
 
 #include "../threads.hpp"
+#include "../two_floats.hpp"
 #include "inverse_roots.hpp"
 
 namespace eip {
@@ -68,7 +69,7 @@ inline void store_bodies(const Vector *xyz, double *a) {
 
 // x, y and z of the bodies `first` to first + TARGETS - 1, that of target k % TARGETS in lane k.
 template <int TARGETS>
-inline void load_targets(const double *q, int64_t first, Octet *xyz) {
+inline void load_targets(const double *q, int64_t first, Lanes8 *xyz) {
     const double *a = q + 3 * first;
     if constexpr (TARGETS < WIDTH) {
         for (int c = 0; c < 3; ++c)
@@ -85,14 +86,14 @@ inline void load_targets(const double *q, int64_t first, Octet *xyz) {
 
 // x, y, z and G m of the bodies j, j + 1, ..., those of stream k / TARGETS in lane k.
 template <int TARGETS>
-inline void load_sources(const double *q, const double *gm, int64_t j, Octet *xyz, Octet &m) {
+inline void load_sources(const double *q, const double *gm, int64_t j, Lanes8 *xyz, Lanes8 &m) {
     const double *a = q + 3 * j;
 #if defined(__AVX__)
     if constexpr (TARGETS == 2) {
         Vector of[4];
         load_bodies(a, of);
         of[3] = load(gm + j);
-        Octet *out[4] = {xyz, xyz + 1, xyz + 2, &m};
+        Lanes8 *out[4] = {xyz, xyz + 1, xyz + 2, &m};
         for (int c = 0; c < 4; ++c) {
             out[c]->part[0] = __builtin_shufflevector(of[c], of[c], 0, 0, 1, 1);
             out[c]->part[1] = __builtin_shufflevector(of[c], of[c], 2, 2, 3, 3);
@@ -109,7 +110,7 @@ inline void load_sources(const double *q, const double *gm, int64_t j, Octet *xy
 
 // The streams of each target added by halves, in the first lanes.
 template <int TARGETS>
-inline Octet folded(Octet sums) {
+inline Lanes8 folded(Lanes8 sums) {
     for (int width = LANES / 2; width >= std::max(TARGETS, WIDTH); width /= 2)
         for (int v = 0; v < width / WIDTH; ++v) sums.part[v] += sums.part[v + width / WIDTH];
 #if defined(__AVX__)
@@ -119,8 +120,8 @@ inline Octet folded(Octet sums) {
 }
 
 template <int TARGETS>
-inline void store_targets(const Octet *xyz, double *out, int64_t first) {
-    Octet sums[3];
+inline void store_targets(const Lanes8 *xyz, double *out, int64_t first) {
+    Lanes8 sums[3];
     for (int c = 0; c < 3; ++c) sums[c] = folded<TARGETS>(xyz[c]);
     for (int k = 0; k < TARGETS; k += WIDTH) {
         const Vector parts[3] = {sums[0].part[k / WIDTH], sums[1].part[k / WIDTH], sums[2].part[k / WIDTH]};
@@ -133,7 +134,7 @@ template <int ROWS>
 struct Choices {
     double row[ROWS][LANES];
 
-    Octet operator()(int64_t k) const { return Octet::load(row[std::clamp<int64_t>(k, 0, ROWS - 1)]); }
+    Lanes8 operator()(int64_t k) const { return Lanes8::load(row[std::clamp<int64_t>(k, 0, ROWS - 1)]); }
 };
 
 // 1 where source j of the first stream, j + 1 of the next, ... is the target in that lane; by j - first target + STREAMS.
@@ -162,15 +163,15 @@ constexpr Choices<LANES + 1> LANES_FROM = [] {
     return rows;
 }();
 
-inline Octet squares(const Octet &x, const Octet &y, const Octet &z, const Octet &start) {
+inline Lanes8 squares(const Lanes8 &x, const Lanes8 &y, const Lanes8 &z, const Lanes8 &start) {
     return multiply_add(z, z, multiply_add(y, y, multiply_add(x, x, start)));
 }
 
 // G m of the targets, in the first stream.
 template <int TARGETS>
-inline Octet masses_of_targets(const double *gm, int64_t first) {
-    if constexpr (TARGETS == LANES) return Octet::load(gm + first);
-    Octet m = 0.0;
+inline Lanes8 masses_of_targets(const double *gm, int64_t first) {
+    if constexpr (TARGETS == LANES) return Lanes8::load(gm + first);
+    Lanes8 m = 0.0;
     for (int k = 0; k < TARGETS; ++k) m.part[k / WIDTH][k % WIDTH] = gm[first + k];
     return m;
 }
@@ -178,20 +179,20 @@ inline Octet masses_of_targets(const double *gm, int64_t first) {
 // Adds to `sums` the pulls of the sources j, j + 1, ..., each times `used`. With APART j is 0, and `apart` becomes the sums with
 // the targets' own pulls on the first body, which it is accelerated by, in the place of its pulls.
 template <int TARGETS, bool APART = false>
-inline void add_sources(const double *q, const double *gm, const Octet *own, int64_t j, int64_t first, Octet *sums,
-                        const Octet &used, Octet *apart = nullptr) {
-    Octet d[3], m;
+inline void add_sources(const double *q, const double *gm, const Lanes8 *own, int64_t j, int64_t first, Lanes8 *sums,
+                        const Lanes8 &used, Lanes8 *apart = nullptr) {
+    Lanes8 d[3], m;
     load_sources<TARGETS>(q, gm, j, d, m);
     for (int c = 0; c < 3; ++c) d[c] -= own[c];
     // A body's own pull is 0 / 1.
-    const Octet itself = ITSELF<TARGETS>(j - first + LANES / TARGETS);
+    const Lanes8 itself = ITSELF<TARGETS>(j - first + LANES / TARGETS);
     const Cube cube(squares(d[0], d[1], d[2], itself));
     if constexpr (APART) {
-        const Octet others = m * used * LANES_FROM(TARGETS);
-        const Octet w = cube.times(others - masses_of_targets<TARGETS>(gm, first));
+        const Lanes8 others = m * used * LANES_FROM(TARGETS);
+        const Lanes8 w = cube.times(others - masses_of_targets<TARGETS>(gm, first));
         for (int c = 0; c < 3; ++c) apart[c] = multiply_add(w, d[c], sums[c]);
     }
-    const Octet w = cube.times(m * used);
+    const Lanes8 w = cube.times(m * used);
     for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
 }
 
@@ -199,13 +200,13 @@ inline void add_sources(const double *q, const double *gm, const Octet *own, int
 template <bool APART, int TARGETS>
 inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls) {
     constexpr int STREAMS = LANES / TARGETS;
-    Octet own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
+    Lanes8 own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
     load_targets<TARGETS>(q, first, own);
     const int64_t start = n % STREAMS, last = APART && start == 0 ? STREAMS : start;
 #pragma GCC unroll 2
     for (int64_t j = n - STREAMS; j >= last; j -= STREAMS) add_sources<TARGETS>(q, gm, own, j, first, sums, 1.0);
     if (APART || start > 0) {
-        const Octet used = start > 0 ? STREAMS_BELOW<TARGETS>(start) : Octet(1.0);
+        const Lanes8 used = start > 0 ? STREAMS_BELOW<TARGETS>(start) : Lanes8(1.0);
         add_sources<TARGETS, APART>(q, gm, own, 0, first, sums, used, apart);
     }
     store_targets<TARGETS>(sums, out, first);
@@ -221,11 +222,11 @@ struct LastTwo {
 
     // Begins with the pull of the two on each other; a body's own is 0.
     LastTwo(const double *q, const double *gm, int64_t first) {
-        Octet between[3];
+        Lanes8 between[3];
         for (int c = 0; c < 3; ++c) between[c] = q[3 * (first + 1) + c] - q[3 * first + c];
         const Cube cube(squares(between[0], between[1], between[2], 0.0));
         for (int t = 0; t < 2; ++t) {
-            const auto beside_own = [=](const Octet &v) {
+            const auto beside_own = [=](const Lanes8 &v) {
                 return t == 0 ? __builtin_shufflevector(v.part[0], Vector{}, 4, 0, 4, 4)
                               : __builtin_shufflevector(v.part[0], Vector{}, 0, 4, 4, 4);
             };
@@ -238,12 +239,12 @@ struct LastTwo {
     }
 
     // Adds the reactions of eight sources to target t, the last blocks first; `w_own` are those of its pulls on the first of them.
-    void take(int t, const Octet &reaction, const Octet *distance, Vector w_own) {
+    void take(int t, const Lanes8 &reaction, const Lanes8 *distance, Vector w_own) {
         own[t] = w_own;
-        const auto across = [](const Octet &v, Vector behind) {
+        const auto across = [](const Lanes8 &v, Vector behind) {
             return __builtin_shufflevector(v.part[1], behind, 2, 3, 4, 5);
         };
-        const auto within = [](const Octet &v) { return __builtin_shufflevector(v.part[0], v.part[1], 2, 3, 4, 5); };
+        const auto within = [](const Lanes8 &v) { return __builtin_shufflevector(v.part[0], v.part[1], 2, 3, 4, 5); };
         const Vector pull = across(reaction, w[t]);
         for (int c = 0; c < 3; ++c) {
             const Vector first = fused(-pull, across(distance[c], d[t][c]), sums[t][c]);
@@ -280,16 +281,16 @@ struct LastTwo {
 template <bool APART>
 inline void accelerate_block(const double *q, const double *gm, int64_t n, int64_t first, double *out, double *pulls,
                              LastTwo &last) {
-    Octet own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
+    Lanes8 own[3], sums[3] = {0.0, 0.0, 0.0}, apart[3];
     load_targets<LANES>(q, first, own);
     for (int t = 1; t >= 0; --t) {
-        Octet d[3], m;
+        Lanes8 d[3], m;
         load_sources<LANES>(q, gm, n - 2 + t, d, m);
         for (int c = 0; c < 3; ++c) d[c] -= own[c];
         const Cube cube(squares(d[0], d[1], d[2], 0.0));
-        const Octet w = cube.times(m);
+        const Lanes8 w = cube.times(m);
         for (int c = 0; c < 3; ++c) sums[c] = multiply_add(w, d[c], sums[c]);
-        last.take(t, cube.times(Octet::load(gm + first)), d, w.part[0]);
+        last.take(t, cube.times(Lanes8::load(gm + first)), d, w.part[0]);
     }
 #pragma GCC unroll 2
     for (int64_t j = n - 3; j >= (APART ? 1 : 0); --j) add_sources<LANES>(q, gm, own, j, first, sums, 1.0);
@@ -332,31 +333,21 @@ inline void accelerate_few(const T *q, const T *gm, int64_t n, T *out, T *pulls 
 
 // A number and what its rounding left.
 struct Carried {
-    Octet total = 0.0, carry = 0.0;
+    Lanes8 total = 0.0, carry = 0.0;
 
-    void add_product(const Octet &a, const Octet &b) {
-        const Octet sum = multiply_add(a, b, total);
+    void add_product(const Lanes8 &a, const Lanes8 &b) {
+        const Lanes8 sum = multiply_add(a, b, total);
         carry += multiply_add(a, b, total - sum);
         total = sum;
     }
 };
 
-// a + b, and its rounding error (Knuth) in `lost`.
-template <class T>
-inline T carried_sum(const T &a, const T &b, T &lost) {
-    const T total = a + b, part = total - a;
-    lost = (a - (total - part)) + (b - part);
-    return total;
-}
-
 // gm (square / 2 - potential) with its carry.
-inline Carried energy_of(const Octet &gm, const Carried &square, const Carried &potential) {
-    Octet lost;
-    const Octet energy = carried_sum<Octet>(0.5 * square.total, -potential.total, lost);
-    lost += 0.5 * square.carry - potential.carry;
+inline Carried energy_of(const Lanes8 &gm, const Carried &square, const Carried &potential) {
+    const PairOf<Lanes8> energy = two_sum<Lanes8>(0.5 * square.total, -potential.total);
     Carried out;
-    out.add_product(gm, energy);
-    out.carry = multiply_add(gm, lost, out.carry);
+    out.add_product(gm, energy.value);
+    out.carry = multiply_add(gm, energy.rest + (0.5 * square.carry - potential.carry), out.carry);
     return out;
 }
 
@@ -367,46 +358,46 @@ inline double carried_fold(const Carried &sum) {
     sum.carry.store(carry);
     for (int width = LANES / 2; width > 0; width /= 2)
         for (int k = 0; k < width; ++k) {
-            double lost;
-            total[k] = carried_sum(total[k], total[k + width], lost);
-            carry[k] = (carry[k] + carry[k + width]) + lost;
+            const Pair sum = two_sum(total[k], total[k + width]);
+            total[k] = sum.value;
+            carry[k] = (carry[k] + carry[k + width]) + sum.rest;
         }
     return total[0] + carry[0];
 }
 
 // Adds to `potential` what source j makes of it at the bodies x, each times `mass`; `start` is 1 where that is 0.
-inline void add_potential(const double *q, int64_t j, const Octet *x, const Octet &mass, const Octet &start,
+inline void add_potential(const double *q, int64_t j, const Lanes8 *x, const Lanes8 &mass, const Lanes8 &start,
                           Carried &potential) {
-    Octet d[3];
-    for (int c = 0; c < 3; ++c) d[c] = Octet(q[3 * j + c]) - x[c];
+    Lanes8 d[3];
+    for (int c = 0; c < 3; ++c) d[c] = Lanes8(q[3 * j + c]) - x[c];
     potential.add_product(mass, over_root(squares(d[0], d[1], d[2], start)));
 }
 
 // The pairs of the bodies first + skip ... first + 7, which are at x, with each other.
-inline void add_own_pairs(const double *q, const double *gm, int64_t first, int64_t skip, const Octet *x,
+inline void add_own_pairs(const double *q, const double *gm, int64_t first, int64_t skip, const Lanes8 *x,
                           Carried &potential) {
     for (int64_t j = first + skip + 1; j < first + LANES; ++j) {
         // Not the body itself, nor those after it in the block, which meet this one as a source.
-        const Octet done = LANES_FROM(j - first);
-        add_potential(q, j, x, multiply_add(Octet(-gm[j]), done, Octet(gm[j])), done, potential);
+        const Lanes8 done = LANES_FROM(j - first);
+        add_potential(q, j, x, multiply_add(Lanes8(-gm[j]), done, Lanes8(gm[j])), done, potential);
     }
 }
 
 // Their energy, with this potential.
 inline double energy_of_block(const double *v, const double *gm, int64_t first, int64_t skip,
                               const Carried &potential) {
-    Octet u[3];
+    Lanes8 u[3];
     Carried square;
     load_targets<LANES>(v, first, u);
-    for (const Octet &part : u) square.add_product(part, part);
-    return carried_fold(energy_of(Octet::load(gm + first) * LANES_FROM(skip), square, potential));
+    for (const Lanes8 &part : u) square.add_product(part, part);
+    return carried_fold(energy_of(Lanes8::load(gm + first) * LANES_FROM(skip), square, potential));
 }
 
 // Their energy, with the pairs that they make with the bodies j, j + STEP, ... before `end`.
 template <int STEP>
 [[gnu::flatten, gnu::noinline]] inline double energy_with(const double *q, const double *v, const double *gm,
                                                           int64_t first, int64_t skip, int64_t j, int64_t end) {
-    Octet x[3];
+    Lanes8 x[3];
     Carried potential;
     load_targets<LANES>(q, first, x);
     add_own_pairs(q, gm, first, skip, x, potential);
@@ -468,7 +459,7 @@ struct PairRows {
 
     [[gnu::flatten, gnu::noinline]] void take(int64_t row) const {
         for (int64_t block = start(row); block < start(row + 1); block += LANES) {
-            Octet own[3], sums[3] = {0.0, 0.0, 0.0};
+            Lanes8 own[3], sums[3] = {0.0, 0.0, 0.0};
             load_targets<LANES>(q, block, own);
             for (int64_t j = block + LANES - 1; j >= block; --j) add_sources<LANES>(q, gm, own, j, block, sums, 1.0);
             store_targets<LANES>(sums, out, block);
@@ -483,19 +474,19 @@ struct PairRows {
         constexpr int KEPT = VECTORS / 2;
         Vector kept[TILE][3][KEPT] = {};
         for (int64_t block = std::max(start(row), tile); block < start(row + 1); block += LANES) {
-            Octet own[3], sums[3];
+            Lanes8 own[3], sums[3];
             Carried potential;
             load_targets<LANES>(q, block, own);
             load_targets<LANES>(out, block, sums);
             if constexpr (ENERGY) potential = potential_of(block);
-            const Octet masses = -Octet::load(gm + block);
+            const Lanes8 masses = -Lanes8::load(gm + block);
             for (int64_t j = std::min(tile + TILE, block) - 1; j >= tile; --j) {
-                Octet d[3];
-                for (int c = 0; c < 3; ++c) d[c] = Octet(q[3 * j + c]) - own[c];
-                const Octet r2 = squares(d[0], d[1], d[2], 0.0);
+                Lanes8 d[3];
+                for (int c = 0; c < 3; ++c) d[c] = Lanes8(q[3 * j + c]) - own[c];
+                const Lanes8 r2 = squares(d[0], d[1], d[2], 0.0);
                 const Cube powers(r2);
                 if constexpr (ENERGY) potential.add_product(gm[j], powers.root(r2));
-                const Octet cube = powers.alone(), w = cube * gm[j], back = cube * masses;
+                const Lanes8 cube = powers.alone(), w = cube * gm[j], back = cube * masses;
                 for (int c = 0; c < 3; ++c) {
                     sums[c] = multiply_add(w, d[c], sums[c]);
                     Vector *sum = kept[j - tile][c];
@@ -516,7 +507,7 @@ struct PairRows {
     // Adds the reactions of the later bodies and the pulls of the first ones.
     [[gnu::flatten, gnu::noinline]] void finish(int64_t row) const {
         for (int64_t block = start(row); block < start(row + 1); block += LANES) {
-            Octet own[3], sums[3], apart[3];
+            Lanes8 own[3], sums[3], apart[3];
             for (int64_t k = count - 1; k >= row; --k)
                 for (int64_t i = 3 * block; i < 3 * (block + LANES); ++i) out[i] += reactions[3 * n * k + i];
             load_targets<LANES>(q, block, own);
@@ -601,11 +592,11 @@ struct Streams {
     }
 };
 
-inline void add_pull(const Octet &w, const Octet *d, Octet *out) {
+inline void add_pull(const Lanes8 &w, const Lanes8 *d, Lanes8 *out) {
     for (int c = 0; c < 3; ++c) out[c] = multiply_add(w, d[c], out[c]);
 }
 
-inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
+inline Lanes8 difference(const Lanes8 *q, int64_t i, int64_t j, Lanes8 *d) {
     for (int c = 0; c < 3; ++c) d[c] = q[3 * j + c] - q[3 * i + c];
     return multiply_add(d[2], d[2], multiply_add(d[1], d[1], d[0] * d[0]));
 }
@@ -613,7 +604,7 @@ inline Octet difference(const Octet *q, int64_t i, int64_t j, Octet *d) {
 // Many bodies of eight members, one member after the other: a vector holds eight bodies of one member then. one(state, masses,
 // result) fills `results` numbers from a state of `size`.
 template <class One>
-inline void one_by_one(const Octet *y, int64_t size, const Octet *gm, int64_t n, Octet *out, int64_t results,
+inline void one_by_one(const Lanes8 *y, int64_t size, const Lanes8 *gm, int64_t n, Lanes8 *out, int64_t results,
                        const One &one) {
     std::vector<double> own(size + n + results);
     double *state = own.data(), *mass = state + size, *result = mass + n;
@@ -626,7 +617,7 @@ inline void one_by_one(const Octet *y, int64_t size, const Octet *gm, int64_t n,
     }
 }
 
-[[gnu::noinline]] inline void accelerate_each(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+[[gnu::noinline]] inline void accelerate_each(const Lanes8 *q, const Lanes8 *gm, int64_t n, Lanes8 *out) {
     one_by_one(q, 3 * n, gm, n, out, 3 * n,
                [n](const double *place, const double *mass, double *pull) { accelerate(place, mass, n, pull); });
 }
@@ -634,12 +625,12 @@ inline void one_by_one(const Octet *y, int64_t size, const Octet *gm, int64_t n,
 // Computes the accelerations for eight members: every pair once, and sums in the same order as for one state. Bodies
 // that are in the last block of one state get their sums in streams: the sums of body i begin at index 3 streams (i -
 // first) of `sums`.
-inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
+inline void accelerate(const Lanes8 *q, const Lanes8 *gm, int64_t n, Lanes8 *out) {
     if (n >= MANY) return accelerate_each(q, gm, n, out);
     if (n < 4) return accelerate_few(q, gm, n, out);
     const Streams streams(n);
     const int64_t start = n % streams.count;
-    Octet sums[3 * 2 * 7];  // in streams, at seven bodies
+    Lanes8 sums[3 * 2 * 7];  // in streams, at seven bodies
     const auto place = [&](int64_t body, int64_t other) {
         if (body < streams.first) return out + 3 * body;
         const int64_t stream = other < start ? other : (other - start) % streams.count;
@@ -649,14 +640,14 @@ inline void accelerate(const Octet *q, const Octet *gm, int64_t n, Octet *out) {
     std::fill(sums, sums + 3 * streams.count * (n - streams.first), 0.0);
     for (int64_t i = n - 1; i > 0; --i)
         for (int64_t j = i - 1; j >= 0; --j) {
-            Octet d[3];
+            Lanes8 d[3];
             const Cube cube(difference(q, i, j, d));
             add_pull(cube.times(gm[j]), d, place(i, j));
             add_pull(-cube.times(gm[i]), d, place(j, i));
         }
     for (int64_t i = streams.first; i < n; ++i)
         for (int c = 0; c < 3; ++c) {
-            const Octet *s = sums + 3 * streams.count * (i - streams.first) + c;
+            const Lanes8 *s = sums + 3 * streams.count * (i - streams.first) + c;
             out[3 * i + c] = streams.count == 4 ? (s[0] + s[6]) + (s[3] + s[9]) : s[0] + s[3];
         }
 }
@@ -712,11 +703,11 @@ inline double accelerate_with_energy(const double *y, const double *gm, int64_t 
 
 // Returns the energy of body i with its later partners, for eight members. The bodies' energies are added in the order
 // in which the code for one state adds its lanes.
-inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_t i) {
+inline Carried energy_of_body(const Lanes8 *y, const Lanes8 *gm, int64_t n, int64_t i) {
     Carried square, potential;
     for (int64_t j = i + 1; j < n; ++j) {
-        Octet d[3];
-        const Octet r2 = difference(y, i, j, d);
+        Lanes8 d[3];
+        const Lanes8 r2 = difference(y, i, j, d);
         potential.add_product(gm[j], over_root(r2));
     }
     for (int64_t k = 3 * (n + i); k < 3 * (n + i) + 3; ++k) square.add_product(y[k], y[k]);
@@ -724,21 +715,18 @@ inline Carried energy_of_body(const Octet *y, const Octet *gm, int64_t n, int64_
 }
 
 // Bodies k, k + stride, ... of a block of eight, added by halves.
-inline Carried energy_of_some(const Octet *y, const Octet *gm, int64_t n, int64_t first, int64_t skip, int k,
+inline Carried energy_of_some(const Lanes8 *y, const Lanes8 *gm, int64_t n, int64_t first, int64_t skip, int k,
                               int stride) {
     if (stride == LANES) return k >= skip ? energy_of_body(y, gm, n, first + k) : Carried{};
     const Carried a = energy_of_some(y, gm, n, first, skip, k, 2 * stride);
     const Carried b = energy_of_some(y, gm, n, first, skip, k + stride, 2 * stride);
-    Carried out;
-    Octet lost;
-    out.total = carried_sum(a.total, b.total, lost);
-    out.carry = (a.carry + b.carry) + lost;
-    return out;
+    const PairOf<Lanes8> sum = two_sum(a.total, b.total);
+    return {sum.value, (a.carry + b.carry) + sum.rest};
 }
 
-inline Octet energy_sum(const Octet *y, const Octet *gm, int64_t n) {
+inline Lanes8 energy_sum(const Lanes8 *y, const Lanes8 *gm, int64_t n) {
     if (n < 8) return energy_of_few(y, gm, n);
-    Octet total = 0.0;
+    Lanes8 total = 0.0;
     if (n >= MANY) {
         one_by_one(y, 6 * n, gm, n, &total, 1, [n](const double *state, const double *mass, double *energy) {
             *energy = energy_sum(state, mass, n);

@@ -13,22 +13,22 @@ namespace eip {
 
 // The terms of one source, or of one in each stream, at a block of targets: q_j - q_i, G m / r^3 and 3 G m / r^5.
 struct Tide {
-    Octet way[3], pull, radial;
+    Lanes8 way[3], pull, radial;
 
     // The change of the targets' accelerations by that of the way to the source.
-    void add(const Octet *change, Octet *sums) const {
-        const Octet along =
+    void add(const Lanes8 *change, Lanes8 *sums) const {
+        const Lanes8 along =
             radial * multiply_add(way[2], change[2], multiply_add(way[1], change[1], way[0] * change[0]));
         for (int c = 0; c < 3; ++c) sums[c] = multiply_add(-along, way[c], multiply_add(pull, change[c], sums[c]));
     }
 };
 
 // From q_j - q_i of both; `itself` is 1 where the source is the target.
-inline Tide tide_of(const Octet *way, const Octet &m, const Octet &itself) {
+inline Tide tide_of(const Lanes8 *way, const Lanes8 &m, const Lanes8 &itself) {
     const Cube cube(squares(way[0], way[1], way[2], itself));
     Tide tide{{way[0], way[1], way[2]}, cube.times(m), {}};
     // 1/r^2 = y^2 / (1 - h) = y^2 (1 + h + h^2), to the last bit: h is below 2e-6.
-    const Octet over_square = multiply_add(cube.y2 * cube.h, cube.h + 1.0, cube.y2);
+    const Lanes8 over_square = multiply_add(cube.y2 * cube.h, cube.h + 1.0, cube.y2);
     tide.radial = 3.0 * tide.pull * over_square;
     return tide;
 }
@@ -38,7 +38,7 @@ template <int TARGETS, class Visit>
 inline void for_sources(int64_t n, const Visit &visit) {
     constexpr int STREAMS = LANES / TARGETS;
     const int64_t start = n % STREAMS;
-    for (int64_t j = n - STREAMS; j >= start; j -= STREAMS) visit(j, Octet(1.0));
+    for (int64_t j = n - STREAMS; j >= start; j -= STREAMS) visit(j, Lanes8(1.0));
     if (start > 0) visit(0, STREAMS_BELOW<TARGETS>(start));
 }
 
@@ -47,10 +47,10 @@ inline void for_sources(int64_t n, const Visit &visit) {
 template <int TARGETS>
 inline void tidal_block(const double *y, const double *gm, int64_t n, int64_t first, int64_t columns, double *out,
                         Tide *tides) {
-    Octet own[3], sums[3] = {0.0, 0.0, 0.0}, d[3], m;
+    Lanes8 own[3], sums[3] = {0.0, 0.0, 0.0}, d[3], m;
     load_targets<TARGETS>(y, first, own);
     Tide *tide = tides;
-    for_sources<TARGETS>(n, [&](int64_t j, const Octet &used) {
+    for_sources<TARGETS>(n, [&](int64_t j, const Lanes8 &used) {
         load_sources<TARGETS>(y, gm, j, d, m);
         for (int c = 0; c < 3; ++c) d[c] -= own[c];
         *tide = tide_of(d, m * used, ITSELF<TARGETS>(j - first + LANES / TARGETS));
@@ -61,9 +61,9 @@ inline void tidal_block(const double *y, const double *gm, int64_t n, int64_t fi
     for (int64_t k = 1; k <= columns; ++k) {
         const double *column = y + 6 * n * k;
         load_targets<TARGETS>(column, first, own);
-        for (Octet &sum : sums) sum = 0.0;
+        for (Lanes8 &sum : sums) sum = 0.0;
         tide = tides;
-        for_sources<TARGETS>(n, [&](int64_t j, const Octet &) {
+        for_sources<TARGETS>(n, [&](int64_t j, const Lanes8 &) {
             load_sources<TARGETS>(column, gm, j, d, m);
             for (int c = 0; c < 3; ++c) d[c] -= own[c];
             tide++->add(d, sums);
@@ -122,7 +122,7 @@ inline void newton_variational(const double *y, const double *gm, int64_t n, int
 }
 
 // Does so for eight members: in vectors for few bodies, otherwise one after the other.
-inline void newton_variational(const Octet *y, const Octet *gm, int64_t n, int64_t columns, Octet *out) {
+inline void newton_variational(const Lanes8 *y, const Lanes8 *gm, int64_t n, int64_t columns, Lanes8 *out) {
     if (n < 4) {
         for (int64_t k = 0; k <= columns; ++k) std::copy(y + 6 * n * k + 3 * n, y + 6 * n * (k + 1), out + 6 * n * k);
         return tides_of_few(y, gm, n, columns, out);

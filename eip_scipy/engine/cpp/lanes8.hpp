@@ -68,26 +68,27 @@ struct Mask {
     bool lane(int64_t k) const { return (bits() >> k & 1U) != 0; }
     bool any() const { return bits() != 0; }
     bool all() const { return bits() == (1U << LANES) - 1U; }
+    void set(int64_t k, bool value) { part[k / WIDTH][k % WIDTH] = value ? -1 : 0; }
 };
 
-struct Octet {
+struct Lanes8 {
     Vector part[VECTORS];
 
-    Octet() = default;
+    Lanes8() = default;
     // Vector by vector: GCC copies the whole in pieces of 8 and 16 bytes, by way of memory.
-    Octet(const Octet &x) {
+    Lanes8(const Lanes8 &x) {
         for (int v = 0; v < VECTORS; ++v) part[v] = x.part[v];
     }
-    Octet &operator=(const Octet &x) {
+    Lanes8 &operator=(const Lanes8 &x) {
         for (int v = 0; v < VECTORS; ++v) part[v] = x.part[v];
         return *this;
     }
-    Octet(double x) {  // NOLINT: a number stands for itself in every lane
+    Lanes8(double x) {  // NOLINT: a number stands for itself in every lane
         for (Vector &v : part) v = spread_vector(x);
     }
 
-    static Octet load(const double *a) {
-        Octet x;
+    static Lanes8 load(const double *a) {
+        Lanes8 x;
         for (int v = 0; v < VECTORS; ++v) x.part[v] = eip::load(a + v * WIDTH);
         return x;
     }
@@ -98,7 +99,7 @@ struct Octet {
 };
 
 // Arrays of vectors are also arrays of 8 n floats, and masks choose lane by lane.
-static_assert(sizeof(Octet) == LANES * sizeof(double) && sizeof(Mask) == sizeof(Octet) &&
+static_assert(sizeof(Lanes8) == LANES * sizeof(double) && sizeof(Mask) == sizeof(Lanes8) &&
               sizeof(Bits) == sizeof(Vector));
 
 #define EIP_FOR_PARTS(Result, expression)                       \
@@ -106,35 +107,35 @@ static_assert(sizeof(Octet) == LANES * sizeof(double) && sizeof(Mask) == sizeof(
     for (int v = 0; v < VECTORS; ++v) out.part[v] = expression; \
     return out
 
-inline Octet operator+(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] + b.part[v]); }
-inline Octet operator-(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] - b.part[v]); }
-inline Octet operator*(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] * b.part[v]); }
-inline Octet operator/(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Octet, a.part[v] / b.part[v]); }
-inline Octet operator-(const Octet &a) { EIP_FOR_PARTS(Octet, -a.part[v]); }
-inline Octet &operator+=(Octet &a, const Octet &b) { return a = a + b; }
-inline Octet &operator-=(Octet &a, const Octet &b) { return a = a - b; }
-inline Octet &operator*=(Octet &a, const Octet &b) { return a = a * b; }
-inline Mask operator<(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] < b.part[v]); }
-inline Mask operator<=(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] <= b.part[v]); }
-inline Mask operator>(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] > b.part[v]); }
-inline Mask operator>=(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] >= b.part[v]); }
-inline Mask operator==(const Octet &a, const Octet &b) { EIP_FOR_PARTS(Mask, a.part[v] == b.part[v]); }
+inline Lanes8 operator+(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Lanes8, a.part[v] + b.part[v]); }
+inline Lanes8 operator-(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Lanes8, a.part[v] - b.part[v]); }
+inline Lanes8 operator*(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Lanes8, a.part[v] * b.part[v]); }
+inline Lanes8 operator/(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Lanes8, a.part[v] / b.part[v]); }
+inline Lanes8 operator-(const Lanes8 &a) { EIP_FOR_PARTS(Lanes8, -a.part[v]); }
+inline Lanes8 &operator+=(Lanes8 &a, const Lanes8 &b) { return a = a + b; }
+inline Lanes8 &operator-=(Lanes8 &a, const Lanes8 &b) { return a = a - b; }
+inline Lanes8 &operator*=(Lanes8 &a, const Lanes8 &b) { return a = a * b; }
+inline Mask operator<(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Mask, a.part[v] < b.part[v]); }
+inline Mask operator<=(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Mask, a.part[v] <= b.part[v]); }
+inline Mask operator>(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Mask, a.part[v] > b.part[v]); }
+inline Mask operator>=(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Mask, a.part[v] >= b.part[v]); }
+inline Mask operator==(const Lanes8 &a, const Lanes8 &b) { EIP_FOR_PARTS(Mask, a.part[v] == b.part[v]); }
 inline Mask operator&(const Mask &a, const Mask &b) { EIP_FOR_PARTS(Mask, a.part[v] & b.part[v]); }
 inline Mask operator|(const Mask &a, const Mask &b) { EIP_FOR_PARTS(Mask, a.part[v] | b.part[v]); }
 inline Mask operator!(const Mask &a) { EIP_FOR_PARTS(Mask, ~a.part[v]); }
-inline Octet where(const Mask &mask, const Octet &a, const Octet &b) {
-    EIP_FOR_PARTS(Octet, mask.part[v] ? a.part[v] : b.part[v]);
+inline Lanes8 where(const Mask &mask, const Lanes8 &a, const Lanes8 &b) {
+    EIP_FOR_PARTS(Lanes8, mask.part[v] ? a.part[v] : b.part[v]);
 }
-inline Octet sqrt(const Octet &a) { EIP_FOR_PARTS(Octet, sqrt(a.part[v])); }
-inline Octet abs(const Octet &a) { EIP_FOR_PARTS(Octet, absolute(a.part[v])); }
-inline Octet multiply_add(const Octet &a, const Octet &b, const Octet &c) {
-    EIP_FOR_PARTS(Octet, fused(a.part[v], b.part[v], c.part[v]));
+inline Lanes8 sqrt(const Lanes8 &a) { EIP_FOR_PARTS(Lanes8, sqrt(a.part[v])); }
+inline Lanes8 abs(const Lanes8 &a) { EIP_FOR_PARTS(Lanes8, absolute(a.part[v])); }
+inline Lanes8 multiply_add(const Lanes8 &a, const Lanes8 &b, const Lanes8 &c) {
+    EIP_FOR_PARTS(Lanes8, fused(a.part[v], b.part[v], c.part[v]));
 }
 
 #undef EIP_FOR_PARTS
 
-inline Octet max(const Octet &a, const Octet &b) { return where(b > a, b, a); }
-inline Octet min(const Octet &a, const Octet &b) { return where(b < a, b, a); }
+inline Lanes8 max(const Lanes8 &a, const Lanes8 &b) { return where(b > a, b, a); }
+inline Lanes8 min(const Lanes8 &a, const Lanes8 &b) { return where(b < a, b, a); }
 inline double multiply_add(double a, double b, double c) { return fused(a, b, c); }
 
 }  // namespace eip
