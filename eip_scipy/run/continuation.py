@@ -72,8 +72,7 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
     asked = {name: value for name, value in origin.arguments.items() if name not in FIRST_PART}
     asked |= {"t_span": (origin.t, t), "y0": origin.y, "invariants": origin.kept()}
     if result.t_events is not None:
-        own = asked["fun"].events if asked["events"] is None and isinstance(asked["fun"], Problem) else asked["events"]
-        asked["events"] = ContinuedEvents(as_events(own), result.t_events, moved=bool(changes))
+        asked["events"] = ContinuedEvents(as_events(_events(asked)), result.t_events, moved=bool(changes))
     if changes:
         asked = _Restart(result, origin, asked, changes, options).arguments()
     elif options.get("jacobian") is not None:
@@ -110,6 +109,12 @@ def repeated(result: IntegrationResult, events: Sequence[Any]) -> IntegrationRes
         at_start = np.vstack([result.variations[0], np.eye(p, tangents.count, tangents.count - p)])
         asked["variations"] = replace(tangents, initial=at_start)
     return integrate(**asked | {"progress": False, "dense_output": False, "resume": False})
+
+
+def _events(asked: Mapping[str, Any]) -> Any:
+    """Return the events of a run with these arguments of `integrate`, by default those of its problem."""
+    own = asked["events"] is None and isinstance(asked["fun"], Problem)
+    return asked["fun"].events if own else asked["events"]
 
 
 class _Restart:
@@ -321,8 +326,7 @@ def _joined(
     """Return one result for a run, which has the origin `first`, and its continuation, which begins with `changes`."""
     last = vars(two)["_origin"]
     before, after = (
-        [getattr(event, "pointer", event) for event in as_events(origin.arguments["events"])]
-        for origin in (first, last)
+        [getattr(event, "pointer", event) for event in as_events(_events(origin.arguments))] for origin in (first, last)
     )
     if changes or any(name in one for name in OBSERVED):  # the functions that compute them may have changed
         one._observe()

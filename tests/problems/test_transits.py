@@ -65,6 +65,7 @@ def test_encounters_backwards_continued_stored_and_with_other_events(tmp_path):
     run = integrate(problem, **TIGHT)
     half = integrate(problem, (0, 20), **TIGHT).continue_to(40)
     np.testing.assert_allclose(half.encounters, run.encounters, rtol=1e-8)
+    assert [len(times) for times in half.t_events] == [len(times) for times in run.t_events]
     back = integrate(problem, (40, 0), run.y[:, -1], **TIGHT)
     np.testing.assert_allclose(back.encounters, run.encounters, rtol=1e-5)
     run.save(tmp_path / "run.npz")
@@ -168,6 +169,8 @@ def test_any_star_and_axis_and_repeated_runs():
     assert len(one.times) > 3
     np.testing.assert_allclose(two.times, one.times, atol=1e-9)
     np.testing.assert_array_equal(np.array(order)[two.planet], one.planet)
+    back = integrate(nbody(GM, PLACES, SPEEDS, t_span=(0.0, 10.0)), (10, 0), plain.y[:, -1], **TIGHT)
+    np.testing.assert_allclose(transits(back, axis=(0.3, 0.9, 0.1)).times, one.times, atol=1e-7)
 
 
 def test_wrong_arguments():
