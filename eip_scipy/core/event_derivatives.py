@@ -34,6 +34,10 @@ class EventGradient:
         self._problem, self._places, n = problem, tangents.order[0], tangents.n
         fun = event.unaugmented.function  # type: ignore[attr-defined]
         fun = getattr(getattr(fun, "jitted", fun), "py_func", fun)
+        self._gradient: Callable[[float, Array], Array]
+        if hasattr(fun, "by_state"):  # an event of a problem, with its gradient
+            self._gradient = lambda _, z: np.append(fun.by_state(z[-1], z[:n]), np.zeros(z.size - n))
+            return
 
         def value(_: float, z: Array) -> Any:
             given = extra

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -83,7 +83,8 @@ class Problem:
         ``variational(parameters) -> rhs``: the right-hand side ``rhs(t, Y, out, params)``, in place, of Y = (y, first
         column, second column, ...), n numbers each: (f(t, y), Df(t, y) times each column). The last columns are the
         derivatives with respect to the parameters with these indices in `params`. It raises ValueError for parameters
-        without such derivatives.
+        without such derivatives. If it returns a function of the library by parameters, such as
+        "gravity.variational_by_parameters", the run binds it to its own.
     canonical : bool, optional
         True if the state is (q, p) of a Hamiltonian system: tangent maps are then symplectic.
     units : str
@@ -227,6 +228,13 @@ class Problem:
         """
         return {}
 
+    def at_events(self, events: Sequence[Any], times: Any, states: Any, fun: Callable[..., Any]) -> dict[str, Any]:
+        """Return further fields of the result of a run, by name, computed from its events; {} for this class.
+
+        `times` (m,) and `states` (m, n) are those of each event, and ``fun(t, y)`` is the right-hand side.
+        """
+        return {}
+
     @property
     def has_second_order(self) -> bool:
         """True if the problem has a method ``second_order()``, which returns the same problem with the state (q, v)."""
@@ -319,10 +327,10 @@ def library_variational(function: str, names: tuple[str, ...], parameters: tuple
     """Return `library`'s function for ``Problem.variational(parameters)``; `names`: its parameter with a derivative."""
     if not parameters:
         return library[function]
-    if tuple(parameters) != (0,) or not names:
-        known = f"only by parameter 0, {names[0]}" if names else "none by parameters"
+    if tuple(parameters) != (0,):
         raise ValueError(
-            f"variational: {function.partition('.')[0]} has derivatives by its state and {known}; got parameters="
-            f"{tuple(parameters)}. For others, call integrate with a jitted function fun(t, y, params) as fun."
+            f"variational: {function.partition('.')[0]} has derivatives by its state and only by parameter 0, "
+            f"{names[0]}; got parameters={tuple(parameters)}. For others, call integrate with a jitted function "
+            "fun(t, y, params) as fun."
         )
     return library[f"{function}_by_parameter"]

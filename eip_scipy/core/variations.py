@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..engine.native import LibraryFunction
+from ..engine.native import LibraryFunction, library
 from .derivatives import First, NumericalGradient, Products, by_duals, difference_gradient, typical_sizes, with_duals
 from .functions import (
     NotCompilableError,
@@ -28,6 +28,7 @@ from .tangent_vectors import TangentVectors
 __all__ = ["Variations", "augmented_rhs"]
 
 Array = np.ndarray
+BY_PARAMETERS = "_by_parameters"  # ends the names of functions of the library
 LEAST = 1e-3  # size for differences of a parameter that is 0
 
 
@@ -115,10 +116,18 @@ def augmented_rhs(
     if tangents.parameters and scalars(first.extra) != "":
         raise ValueError("variations: derivatives with respect to parameters need params=[...], one array of numbers.")
     if own is not None and jvp is None:
-        return _rearranged(own(tangents.parameters), tangents.order[:, : tangents.n]), "problem"
+        rhs = own(tangents.parameters)
+        if isinstance(rhs, LibraryFunction) and rhs.__name__.endswith(BY_PARAMETERS):
+            return _bound(rhs.__name__, tangents.parameters, first.extra), "problem"
+        return _rearranged(rhs, tangents.order[:, : tangents.n]), "problem"
     products = Products(tangents, fun, form, first)
     rhs, source = products.by_numbers() if jvp is None else (products.by_jvp(jvp), "jvp")
     return _rearranged(rhs, tangents.order), source
+
+
+def _bound(function: str, parameters: tuple[int, ...], extra: tuple) -> LibraryFunction:
+    """Return a function of the library by parameters, bound to those of a run, see problems/by_parameters.hpp."""
+    return library[function].bound((*extra[0], *parameters, len(parameters)))
 
 
 def _rearranged(rhs: Callable[..., Any], places: Array) -> Callable[..., Any]:
@@ -161,7 +170,7 @@ def _augmented(item: Invariant, tangents: TangentVectors, first: First, compiled
 
     def slopes(t: float, y: Array, params: Array) -> Any:
         if by_parameters is not None:
-            return by_parameters(t, y, params)
+            return np.reshape(by_parameters(t, y, params), (*shape, len(places)))
         floors = np.abs(params) + LEAST
         return np.asarray(difference_gradient(lambda p: item.function(t, y.copy(), p), params, floors))[..., places]
 
@@ -201,12 +210,15 @@ def _unaugmented(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> Unaugmented | None:
     """Return what the engine calls for an invariant; None if it would have to call Python for it."""
-    slopes, has_slopes = None, not parameters or is_jitted(item.function)
+    slopes, by_library = None, f"{getattr(item.function, '__name__', '')}{BY_PARAMETERS}"
+    has_slopes = not parameters or is_jitted(item.function) or by_library in library
     if item.args or scalars(extra) is None or not (_has_address(item.function) and has_slopes):
         return None
     try:
         own = with_duals(item, "gradient", n, shape, extra) if item.gradient is None else item
-        if parameters:
+        if parameters and by_library in library:
+            slopes = _bound(by_library, parameters, extra)
+        elif parameters:
             slopes = by_duals("parameter_gradient", own.function, extra[0].size, shape, parameters)
     except NotCompilableError:  # the function is then called from Python
         return None

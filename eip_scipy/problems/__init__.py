@@ -2,6 +2,7 @@
 
 from ..core.problem import Problem
 from .gravity import solar_data as solar_data
+from .gravity.approaches import Transits, transits
 from .gravity.forces import ForceConstants
 from .gravity.nbody import nbody
 from .gravity.orbital_elements import OrbitalElements, orbital_elements
@@ -32,6 +33,7 @@ __all__ = [
     "ParticleProblem",
     "Problem",
     "SolarSystemData",
+    "Transits",
     "centre_time",
     "charged_particle",
     "comet",
@@ -53,5 +55,6 @@ __all__ = [
     "solar_system",
     "time_transformed",
     "tokamak",
+    "transits",
     "uniform_field",
 ]

@@ -26,10 +26,10 @@ from ..engine.data import EPS
 from .fields import OBSERVED, OF_EVENTS, joined
 from .integrate import integrate
 from .origin import Origin
-from .prepare import RunArguments, as_problem, default_method
+from .prepare import RunArguments, as_problem, default_method, started_at
 from .results import IntegrationResult, described
 
-__all__ = ["continue_to", "continued"]
+__all__ = ["continue_to", "continued", "repeated"]
 
 Array = np.ndarray
 # Options of `integrate` that may change where a run continues, apart from what makes a restart.
@@ -41,6 +41,8 @@ CHANGING = (
 RESTARTING = ("y", "params", "fun", "acceleration", "invariants")
 SHOWN = (*RESTARTING, "method", "h", "rtol", "atol", "first_step", "max_step", "events", "check")  # in `restarts`
 DEFINING = ("t_span", "y0")
+# Options that concern what a run saves and shows, and not its steps.
+SAVING = ("t_eval", "save_every", "callback", "checkpoint", "diagnostics")
 FIRST_PART = ("t_eval", "diagnostics")  # arguments that apply to the first part only
 OF_FUNCTION = ("jvp", "jac", "jacobian", "symplectic")  # arguments that belong to the right-hand side
 SAME_ROUNDINGS = 64.0  # of the terms of an invariant, by which equal values may differ
@@ -89,6 +91,24 @@ def continued(result: IntegrationResult, t: float, options: dict[str, Any]) -> I
             known = "_origin" in vars(partial)
             error.partial = _joined(result, origin, partial, changes, what) if known else result  # type: ignore[attr-defined]
         raise
+
+
+def repeated(result: IntegrationResult, events: Sequence[Any]) -> IntegrationResult:
+    """Return the same run again, see `IntegrationResult._repeated`."""
+    origin: Origin = vars(result)["_origin"]
+    given = origin.arguments
+    t0 = started_at(RunArguments.of(**given | {"variations": None}))[0]
+    if result.t[0] != t0:
+        raise ValueError(
+            f"the run begins at t={t0:.10g}, but its first saved state is at t={result.t[0]:.10g}. Pass a run of "
+            "integrate that was not continued, and that saves its start."
+        )
+    asked = given | dict.fromkeys(SAVING) | {"t_span": (t0, origin.t), "events": tuple(events)}
+    if isinstance(tangents := given["variations"], TangentVectors):  # those at the end of the run
+        p = len(tangents.parameters)
+        at_start = np.vstack([result.variations[0], np.eye(p, tangents.count, tangents.count - p)])
+        asked["variations"] = replace(tangents, initial=at_start)
+    return integrate(**asked | {"progress": False, "dense_output": False, "resume": False})
 
 
 class _Restart:

@@ -155,6 +155,7 @@ FIELDS = {
     "target": Field(None, _by(_target), absent=np.nan),
     "max_residual": Field(("invariant",), _by(np.fmax), absent=0.0),
     "variations": Field(("t", "component", "column"), _rows(0)),
+    "encounters": Field(None, _by(lambda one, two: np.concatenate([one, two]))),
     "outputs": Field(("output", "t"), _outputs),
     "multipliers": Field(("constraint", "t"), _multipliers),
     **dict.fromkeys(("method", "h", "message", "status", "success", "units"), Field(())),

@@ -504,6 +504,10 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
         units="" if problem is None else problem.units,
         epoch=None if problem is None else problem.epoch,
     )
+    if problem is not None and events is not None:
+        own = [getattr(getattr(x, "unaugmented", None), "function", x) for x in run.problem.events.functions]
+        fun = tangents.of_state(run.problem.derivative, run.problem.y0)
+        result |= problem.at_events(own, result.t_events, result.y_events, fun)
     if run.problem.variations is not None:
         result["variations"] = tangents.split(y)[1]
         result["columns"] = run.problem.described_columns

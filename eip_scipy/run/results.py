@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -178,6 +178,8 @@ ABSENT = {
     "sensitivities": "this run has no sensitivities; name parameters in variations=[...].",
     "variations": "this run carried no derivatives; ask for them with variations=...",
     **dict.fromkeys(EVENT_DERIVATIVES, "this run has no derivatives at events; give it variations=... and events=..."),
+    "encounters": "this run has no encounters; make its problem by nbody(..., encounters=...), and pass events of your "
+    "own as events=[mine, *problem.events].",
     "multipliers": "this result has no multipliers: its problem is not a mechanical system with constraints.",
     "outputs": "this result has no outputs; give outputs={name: ...} to `mechanism` or `mechanics`.",
 }
@@ -326,6 +328,8 @@ class IntegrationResult(Result):
         "parameters", the number of derivatives with respect to parameters, and "names", the names of these parameters;
         "symplectic", True if the matrix was kept symplectic; "source", the origin of the products with the Jacobian:
         "problem", "jvp", "dual numbers" or "complex steps".
+    encounters : ndarray, shape (m, 5)
+        Closest approaches, of a problem ``nbody(..., encounters=...)``: columns t, i, j, distance and relative speed.
     restarts : list of (float, str)
         Times at which `continue_to` has restarted the run with a change, and the names of what was given: "y, params".
     targets : ndarray, shape (l, m)
@@ -371,6 +375,7 @@ class IntegrationResult(Result):
     epoch: tuple[float, float] | None
     outputs: dict[str, np.ndarray]
     multipliers: Multipliers
+    encounters: np.ndarray
     restarts: list[tuple[float, str]]
     tangent_events: list[np.ndarray]
     time_derivatives: list[np.ndarray]
@@ -476,6 +481,12 @@ class IntegrationResult(Result):
         options |= {name: value for name, value in given.items() if value is not DEFAULT}
         options |= {name: value for name, value in (changes | {"invariants": invariants}).items() if value is not None}
         return continue_to(self, t, options)
+
+    def _repeated(self, events: Sequence[Callable[..., Any]]) -> IntegrationResult:
+        """Return the same run with these events in place of its own; it saves the states at both ends."""
+        from .continuation import repeated
+
+        return repeated(self, events)
 
     def __repr__(self) -> str:
         """Return the fields as text, without `units` and `epoch` if they are not set."""

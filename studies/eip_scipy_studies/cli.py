@@ -19,6 +19,7 @@ COMMANDS = {  # the study, as module:function, and what --help says of it
     "bench": ("bench.command:bench", "error against cost of this package, SciPy, REBOUND, heyoka and others"),
     "bench metric": ("bench.metric:metric", "the default metric against none and euclidean, case by case"),
     "trust": ("trust.command:trust", "whether faulty runs are reported, and correct ones are not"),
+    "transits": ("transits:transit_times", "transit times and derivatives against heyoka in 80 bits and REBOUND"),
     "doctor": ("doctor:doctor", "what is installed, and in seconds whether it works"),
 }
 

@@ -161,10 +161,19 @@ def test_newton(n):
 
 
 RELATIVITY = [(), ("1pn",), ("eih",), ("gr-potential",)]
-OTHERS = [(), ("j2",), ("moon-quadrupole",), ("j2", "moon-quadrupole"), ("drag",), ("j2", "drag")]
+OTHERS = [(), ("j2",), ("j4",), ("moon-quadrupole",), ("j2", "j4", "moon-quadrupole"), ("drag",), ("j2", "drag")]
 # They make all forces as large as Newton's.
 CONSTANTS = ForceConstants(
-    c=1.5, j2=0.4, pole=[1.0, -2.0, 0.5], moon_body=1, moon=0.3, drag=0.2, drag_radius=0.9, scale_height=1.1, spin=0.3
+    c=1.5,
+    j2=0.4,
+    j4=-0.1,
+    pole=[1.0, -2.0, 0.5],
+    moon_body=1,
+    moon=0.3,
+    drag=0.2,
+    drag_radius=0.9,
+    scale_height=1.1,
+    spin=0.3,
 )
 
 
@@ -178,7 +187,7 @@ def test_forces(n):
             assert_variational(problem, problem.y0, rng, (), 5)
 
 
-@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "moon-quadrupole", "drag"])
+@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "j4", "moon-quadrupole", "drag"])
 def test_what_a_force_adds(force):
     """Compare the parts of each force alone, so that Newton's larger part hides nothing."""
     rng = np.random.default_rng(5)
@@ -193,10 +202,39 @@ def test_what_a_force_adds(force):
         np.testing.assert_allclose(found[y.size :], expected, rtol=0, atol=RTOL * np.abs(expected).max())
 
 
-def test_newton_has_no_derivatives_by_masses():
-    problem = nbody(*bodies(np.random.default_rng(0), 3), t_span=(0.0, 1.0))
-    with pytest.raises(ValueError, match=r"gravity has derivatives by its state and none by parameters; got .*\(0,\)"):
-        problem.variational((0,))
+@pytest.mark.parametrize("relativity", RELATIVITY)
+@pytest.mark.parametrize("others", OTHERS)
+@pytest.mark.parametrize("n", [2, 5])
+def test_derivatives_by_masses_and_constants(n, relativity, others):
+    """Sensitivities of short runs against differences of order 8 in each parameter."""
+    rng = np.random.default_rng(n)
+    options = {"constants": replace(CONSTANTS, moon_body=n - 1), "forces": (*relativity, *others)}
+    problem = nbody(*bodies(rng, n, test_particles=n > 2), t_span=(0.0, 0.1), **options)
+    names = [name for name, value in problem.parameters.items() if name[:3] == "gm_" or value != 0]
+    names = [name for name in names if name not in ("relativity", "moon_body")]
+    run = integrate(problem, method=EIPDOP853, h=0.01, variations=["state", *names], check=False)
+    bare = integrate(problem, method=EIPDOP853, h=0.01, variations=["state", *names], invariants=())
+    for k, name in enumerate(names):
+        unit = np.eye(problem.params.size)[list(problem.parameters).index(name)]
+
+        def end(p):
+            return integrate(problem, params=p, method=EIPDOP853, h=0.01, invariants=()).y[:, -1]
+
+        expected = difference(end, problem.params, unit * min(1.0, 4 * (problem.params @ unit) or 1.0))
+        expected /= min(1.0, 4 * (problem.params @ unit) or 1.0)
+        for found in (run.sensitivities[-1][:, k], bare.sensitivities[-1][:, k]):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * max(np.abs(expected).max(), 1e-3))
+
+
+def test_what_is_no_constant_has_no_derivative():
+    problem = nbody(*bodies(np.random.default_rng(0), 3), t_span=(0.0, 1.0), forces="1pn", constants=CONSTANTS)
+    assert list(problem.parameters)[:4] == ["gm_0", "gm_1", "gm_2", "relativity"]
+    with pytest.raises(
+        ValueError, match="the parameter 'relativity' chooses a force, or belongs to one that the problem does"
+    ):
+        integrate(problem, method=EIPDOP853, h=0.1, variations=["relativity"])
+    with pytest.raises(ValueError, match="the parameter 'j2' chooses a force, or belongs to one that"):
+        integrate(problem, method=EIPDOP853, h=0.1, variations=["gm_0", "j2"])
 
 
 def test_columns_do_not_depend_on_each_other():

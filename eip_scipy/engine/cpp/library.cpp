@@ -57,7 +57,7 @@ nb::object called(const LibraryFunction &function, PyObject *arguments) {
         if (PyArray_ResolveWritebackIfCopy(out.get()) < 0) throw nb::python_error();
         return nb::none();
     }
-    if (function.is_numbers() && function.numbers == 1) return nb::float_(out.floats()[0]);
+    if (function.is_numbers() && function.numbers == 1 && !function.by_parameters) return nb::float_(out.floats()[0]);
     return out;
 }
 

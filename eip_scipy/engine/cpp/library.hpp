@@ -75,7 +75,8 @@ struct LibraryFunction {
     LibraryPointer<double> by_pulls = nullptr;  // of rates: from such pulls in the place of f
     const Together *together = nullptr;         // of a derivative; null where there is none
     const WithEnergy *with_energy = nullptr;    // as well
-    std::vector<double> own{};                  // parameters that replace those of the run; empty in the library itself
+    bool by_parameters = false;  // of numbers: as many for each parameter, see problems/by_parameters.hpp
+    std::vector<double> own{};   // parameters that replace those of the run; empty in the library itself
 
     bool is_gradient() const { return value == Value::GRADIENT || value == Value::GRADIENT_BY_F; }
     bool is_numbers() const { return value == Value::NUMBERS || value == Value::RATES; }
@@ -86,7 +87,10 @@ struct LibraryFunction {
         if (is_numbers()) return numbers_of(n);
         return is_gradient() ? numbers_of(n) * n : n;
     }
-    int64_t numbers_of(int64_t n) const { return numbers < 0 ? numbers / EACH_ORBIT * (n / 6 - 1) : numbers; }
+    int64_t numbers_of(int64_t n) const {
+        const int64_t each = by_parameters && !own.empty() ? static_cast<int64_t>(own.back()) : 1;
+        return numbers < 0 ? numbers / EACH_ORBIT * (n / 6 - 1) : numbers * each;
+    }
 };
 
 // Such a function as a run calls it: with its own parameters if it has any, else with those of the run. The object in Python

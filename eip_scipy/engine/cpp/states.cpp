@@ -23,7 +23,8 @@ struct Moduli {
 
     // A state of `length` components, -1 for any number of them.
     Moduli(nb::handle state, const char *name, int64_t length = -1)
-        : n(length), is_complex(is_plain(state.ptr(), NPY_CDOUBLE, 1)) {
+        : n(length),
+          is_complex(is_plain(state.ptr(), NPY_CDOUBLE, 1)) {
         const int type = is_complex ? static_cast<int>(NPY_CDOUBLE) : static_cast<int>(NPY_DOUBLE);
         y = length < 0 ? memory<const double>(state, name, type, Bound{n})
                        : memory<const double>(state, name, type, length);

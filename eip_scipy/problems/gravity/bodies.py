@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,13 @@ import numpy as np
 from ...core.inputs import shown
 from ...core.problem import Problem
 
-__all__ = ["Bodies", "BodiesProblem", "bodies_of", "component_names"]
+# Names of the parameters that follow G m of each body if there are further forces; the order is that of forces.cpp.
+ENTRIES = (
+    *("relativity", "1/c^2", "j2", "pole_x", "pole_y", "pole_z", "moon_body", "moon"),
+    *("drag", "drag_radius", "scale_height", "spin", "j4"),
+)
+
+__all__ = ["ENTRIES", "Bodies", "BodiesProblem", "bodies_of", "component_names"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -24,10 +30,26 @@ class BodiesProblem(Problem):
         Names of the N bodies.
     forces : tuple of str
         Forces in addition to Newton's gravitation.
+    radii : ndarray, shape (N,), optional
+        Radii of the bodies for the option `encounters` of `nbody`.
     """
 
     bodies: tuple[str, ...] = ()
     forces: tuple[str, ...] = ()
+    radii: np.ndarray | None = None
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name: "gm_" and the name of each body, then the constants of the forces."""
+        names = [*(f"gm_{name}" for name in self.bodies), *(ENTRIES if self.forces else ())]
+        return dict(zip(names, np.asarray(self.params).tolist(), strict=True))
+
+    def at_events(self, events: Sequence[Any], times: Any, states: Any, fun: Callable[..., Any]) -> dict[str, Any]:
+        """Return the encounters of a run, see `Problem.at_events`."""
+        from .approaches import encounters  # which imports this module
+
+        table = None if self.radii is None else encounters(self.radii, events, times, states, fun)
+        return {} if table is None else {"encounters": table}
 
 
 class Bodies(NamedTuple):

@@ -24,8 +24,8 @@ from ...engine.native import library
 __all__ = ["FORCES", "ForceConstants", "check_forces", "equations", "invariants", "parameters"]
 
 # Entries after the G m: which relativity (0: none), 1/c^2, J2 R^2, the pole (3), the body with the Moon (-1: none), its
-# coefficient; of drag the coefficient, where it holds, the scale height and the air's rotation.
-KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY, MOON, DRAG, N_ENTRIES = 0, 1, 2, 3, 6, 7, 8, 12
+# coefficient; of drag the coefficient, where it holds, the scale height and the air's rotation; J4 R^4.
+KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY, MOON, DRAG, OBLATENESS_4, N_ENTRIES = 0, 1, 2, 3, 6, 7, 8, 12, 13
 # Round-off of an energy in which large terms nearly cancel: what "kept" means for invariants that are not exact.
 KEPT = 1e-13
 
@@ -42,8 +42,10 @@ class ForceConstants:
         Speed of light, for "1pn", "eih" and "gr-potential".
     j2 : float, optional
         J2 times the square of the Sun's equatorial radius, for "j2".
+    j4 : float, optional
+        J4 times the fourth power of this radius, for "j4".
     pole : sequence of 3 floats, optional
-        Vector of any length along the Sun's axis of rotation, for "j2", and for "drag" with `spin`.
+        Vector of any length along the Sun's axis of rotation, for "j2", "j4", and for "drag" with `spin`.
     moon_body, moon : int and float, optional
         Index of the body that stands for Earth and Moon, and ``a^2 m_E m_M / (4 (m_E + m_M)^2)`` with the radius a of
         the Moon's orbit, for "moon-quadrupole".
@@ -55,6 +57,7 @@ class ForceConstants:
 
     c: float | None = None
     j2: float | None = None
+    j4: float | None = None
     pole: Sequence[float] | None = None
     moon_body: int | None = None
     moon: float | None = None
@@ -93,6 +96,7 @@ FORCES = {
     "eih": Force(("c",), _relativity(2), sees_velocity=True, is_relativity=True),
     "gr-potential": Force(("c",), _relativity(3), is_relativity=True),
     "j2": Force(("j2", "pole"), lambda k: {OBLATENESS: k.j2} | _pole(k), keeps=("H", "L_pole")),
+    "j4": Force(("j4", "pole"), lambda k: {OBLATENESS_4: k.j4} | _pole(k), keeps=("H", "L_pole")),
     "moon-quadrupole": Force(("moon_body", "moon"), lambda k: {MOON_BODY: k.moon_body, MOON: k.moon}),
     "drag": Force(("drag", "drag_radius", "scale_height"), _drag, keeps=(), sees_velocity=True),
 }
@@ -145,7 +149,7 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
         fits = pole.shape == (3,) and np.isfinite(pole).all() and pole.any()
     elif name == "moon_body":
         fits, expected = isinstance(value, int | np.integer) and 0 < value < n, f"an index from 1 to {n - 1}"
-    elif name == "spin":
+    elif name in ("spin", "j4"):
         fits, expected = isfinite(value), "a finite number"
     else:
         fits, expected = isfinite(value) and value > 0, "a finite positive number"

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from ...core.inputs import is_number, real_array, shown
-from ...core.problem import Problem, bind, library_variational
+from ...core.problem import Problem, bind
 from ...core.step_control import interval
 from ...engine.native import library
 from . import forces as _forces
-from .bodies import BodiesProblem, component_names
+from .approaches import approaches, check_distances
+from .bodies import ENTRIES, BodiesProblem, component_names
 from .forces import ForceConstants
 from .frequencies import orbital_frequencies
 from .orbits import balances_of_orbits
@@ -44,6 +45,7 @@ def nbody(
     epoch: tuple[float, float] | None = None,
     G: float | None = None,
     balances: str | Sequence[str] | None = None,
+    encounters: Any = None,
 ) -> Problem:
     """Return the problem of N point masses under Newton's gravitation, with optional further forces.
 
@@ -60,7 +62,7 @@ def nbody(
         Step length.
     forces : str or sequence of str, optional
         Forces in addition to Newton's gravitation: at most one of "1pn", "eih" and "gr-potential", and "j2",
-        "moon-quadrupole" and "drag". All act from the first body (the Sun) except "eih". The page
+        "j4", "moon-quadrupole" and "drag". All act from the first body (the Sun) except "eih". The page
         :doc:`/reference/forces` describes them.
     constants : ForceConstants, optional
         The speed of light and the other constants of the forces, in the units of the state.
@@ -77,6 +79,11 @@ def nbody(
         of the total energy and angular momentum: "kepler" or "energy", "momentum", "laplace", see `orbital_balances`.
         They are made for planetary systems without close encounters over long times, and hold the masses given here: a
         run with other `params` is reported as not to be trusted.
+    encounters : float or array_like, shape (N,), optional
+        Find the closest approaches of all pairs of bodies below this distance, or below the sum of their radii, one of
+        each body. Runs have them as `run.encounters`, an array (m, 5) with the columns t, i, j, distance and relative
+        speed. They are events of the problem: a run with events of its own takes them as ``events=[mine,
+        *problem.events]``. The times of all smallest and largest distances are in `run.t_events`.
 
     Returns
     -------
@@ -138,13 +145,29 @@ def nbody(
         source=source,
         reference=reference,
         jacobian=library["gravity.central"],
-        variational=partial(library_variational, "forces.variational" if chosen else "gravity.variational", ()),
+        variational=partial(_variational, "forces" if chosen else "gravity", masses.size, params),
         frequencies=partial(orbital_frequencies, masses),
         epoch=epoch,
         G=G,
         bodies=labels,
         forces=chosen,
+        radii=None if encounters is None else check_distances(encounters, masses.size),
+        events=None if encounters is None else approaches(masses.size),
     )
+
+
+def _variational(group: str, n: int, params: np.ndarray, parameters: Sequence[int]) -> Any:
+    """Return the function of the library for `Problem.variational`; a force that is not in use has no derivatives."""
+    used = params != 0
+    used[n + _forces.POLE : n + _forces.MOON_BODY] = used[n + _forces.POLE : n + _forces.MOON_BODY].any()
+    used[n + _forces.KIND : n + 1] = used[n + _forces.MOON_BODY : n + _forces.MOON] = False
+    for k in parameters:
+        if k >= n and not used[k]:
+            raise ValueError(
+                f"variations: the parameter {ENTRIES[k - n]!r} chooses a force, or belongs to one that the problem "
+                "does not have. Choose a mass, or a constant of its forces."
+            )
+    return library[f"{group}.variational_by_parameters" if parameters else f"{group}.variational"]
 
 
 def _masses(gm: Any, G: Any) -> np.ndarray:

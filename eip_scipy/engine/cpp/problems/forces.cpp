@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "by_parameters.hpp"
 #include "einstein.hpp"
 #include "tides.hpp"
 
@@ -9,7 +10,20 @@ namespace eip {
 namespace {
 
 // Entries after the G m, and which relativity the first one names.
-enum Entry { KIND, OVER_C2, OBLATENESS, POLE, MOON_BODY = 6, MOON, DRAG, BASE, SCALE_HEIGHT, SPIN, N_ENTRIES };
+enum Entry {
+    KIND,
+    OVER_C2,
+    OBLATENESS,
+    POLE,
+    MOON_BODY = 6,
+    MOON,
+    DRAG,
+    BASE,
+    SCALE_HEIGHT,
+    SPIN,
+    OBLATENESS_4,
+    N_ENTRIES
+};
 constexpr double ONE_PN = 1.0, EIH = 2.0, POTENTIAL = 3.0;
 
 struct Bodies {
@@ -30,6 +44,18 @@ struct Bodies {
 using std::exp;
 using std::sqrt;
 
+// The Sun's J4 at x, of which s is the part along the pole: the acceleration is -w x - along pole.
+template <class T>
+struct FourthHarmonic {
+    T w, along;
+
+    FourthHarmonic(const Bodies &b, const T &s, const T &r2) {
+        const T q = s * s / r2, k = 2.5 * b.gm[0] * b.k[OBLATENESS_4] / (r2 * r2 * r2 * sqrt(r2));
+        w = -0.75 * k * (21.0 * q * q - 14.0 * q + 1.0);
+        along = k * s * (7.0 * q - 3.0);
+    }
+};
+
 // Acceleration of body i at x from the Sun by the terms that depend on positions.
 template <class T>
 Vec3<T> pull(const Vec3<T> &x, const Bodies &b, int64_t i) {
@@ -43,6 +69,11 @@ Vec3<T> pull(const Vec3<T> &x, const Bodies &b, int64_t i) {
         const T s = dot(x, pole), u = 1.5 * gm_sun * b.k[OBLATENESS] / (r2 * r2 * sqrt(r2));
         w += u * (1.0 - 5.0 * s * s / r2);
         along = 2.0 * u * s;
+    }
+    if (b.k[OBLATENESS_4] != 0.0) {
+        const FourthHarmonic<T> j4(b, dot(x, pole), r2);
+        w += j4.w;
+        along += j4.along;
     }
     return {-w * x[0] - along * pole[0], -w * x[1] - along * pole[1], -w * x[2] - along * pole[2]};
 }
@@ -132,6 +163,10 @@ double potential(const double *y, const Bodies &b) {
         if (b.k[OBLATENESS] > 0.0) {
             const double s = dot(x, b.pole());
             part += 0.5 * b.k[OBLATENESS] * over_r3 * (3.0 * s * s / r2 - 1.0);
+        }
+        if (b.k[OBLATENESS_4] != 0.0) {
+            const double s = dot(x, b.pole()), q = s * s / r2;
+            part += 0.125 * b.k[OBLATENESS_4] * over_r3 / r2 * (35.0 * q * q - 30.0 * q + 3.0);
         }
         total += b.gm[i] * part;
     }
@@ -270,22 +305,47 @@ void pair_momentum_gradient(const Given<double> &g) {
 bool with_columns(int64_t n, int64_t p) { return p > N_ENTRIES && n > 0 && n % (6 * (p - N_ENTRIES)) == 0; }
 bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
 bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
+bool is_bound(int64_t n, int64_t p) { return n > 0 && p > N_ENTRIES + 2; }
 bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
 constexpr const char *COLUMNS =
-    "a state of 6 numbers per body, columns of the same size, and as parameters G m of every body and 12 entries of "
+    "a state of 6 numbers per body, columns of the same size, and as parameters G m of every body and 13 entries of "
     "the forces";
 constexpr const char *BODIES =
-    "positions and velocities, 6 numbers per body, and as parameters G m of every body and 12 entries of the forces";
+    "positions and velocities, 6 numbers per body, and as parameters G m of every body and 13 entries of the forces";
 constexpr const char *POSITIONS =
-    "positions, 3 numbers per body, and as parameters G m of every body and 12 entries of the forces";
-constexpr const char *TWO = "a state of 12 numbers, and as parameters G m of both bodies and 12 entries of the forces";
+    "positions, 3 numbers per body, and as parameters G m of every body and 13 entries of the forces";
+constexpr const char *BOUND = "a state of bodies, and to be bound to parameters, the indices of some, and their number";
+constexpr const char *TWO = "a state of 12 numbers, and as parameters G m of both bodies and 13 entries of the forces";
 
 #define EIP_FORCES(name, function, value, numbers, fits, sizes) \
     {name, Value::value, numbers, plain<double, function>, nullptr, fits, sizes}
+#define EIP_BY_PARAMETERS(name, function, numbers)                     \
+    {name "_by_parameters",                                            \
+     Value::NUMBERS,                                                   \
+     numbers,                                                          \
+     plain<double, value_by_parameters<N_ENTRIES, function, numbers>>, \
+     nullptr,                                                          \
+     is_bound,                                                         \
+     BOUND,                                                            \
+     nullptr,                                                          \
+     nullptr,                                                          \
+     nullptr,                                                          \
+     nullptr,                                                          \
+     true}
 const LibraryFunction functions[] = {
     EIP_FORCES("forces.rhs", rhs, DERIVATIVE, 0, of_bodies, BODIES),
     EIP_FORCES("forces.acc", acc, ACCELERATION, 0, at_positions, POSITIONS),
     EIP_FORCES("forces.variational", variational, DERIVATIVE, 0, with_columns, COLUMNS),
+    {"forces.variational_by_parameters", Value::DERIVATIVE, 0,
+     plain<double, variational_by_parameters<N_ENTRIES, variational, rhs>>, nullptr, is_bound, BOUND},
+    EIP_BY_PARAMETERS("forces.energy", energy, 1),
+    EIP_BY_PARAMETERS("forces.momentum", momentum, 3),
+    EIP_BY_PARAMETERS("forces.axial_momentum", axial_momentum, 1),
+    EIP_BY_PARAMETERS("eih.energy", eih_energy, 1),
+    EIP_BY_PARAMETERS("eih.momentum", eih_momentum, 3),
+    EIP_BY_PARAMETERS("eih.axial_momentum", eih_axial_momentum, 1),
+    EIP_BY_PARAMETERS("pair.energy", pair_energy, 1),
+    EIP_BY_PARAMETERS("pair.momentum", pair_momentum, 3),
     EIP_FORCES("forces.energy", energy, NUMBERS, 1, of_bodies, BODIES),
     EIP_FORCES("forces.energy_gradient", gradient_of_energy, GRADIENT_BY_F, 1, of_bodies, BODIES),
     EIP_FORCES("forces.momentum", momentum, NUMBERS, 3, of_bodies, BODIES),
@@ -304,6 +364,7 @@ const LibraryFunction functions[] = {
     EIP_FORCES("pair.momentum_gradient", pair_momentum_gradient, GRADIENT, 3, of_two, TWO),
 };
 #undef EIP_FORCES
+#undef EIP_BY_PARAMETERS
 
 }  // namespace
 
