@@ -38,28 +38,28 @@ OWN = {"variations", "t_eval", "save_every", "symplectic", "reduce", "callback",
 
 
 class ChaosResult(OptimizeResult):
-    """Result of `megno`, `lyapunov_exponent` and `lyapunov_spectrum`; `grid` is the grid's shape, () for one orbit.
+    """Result of `megno`, `lyapunov_exponent` and `lyapunov_spectrum`; ``...`` is the shape of the grid.
 
     Attributes
     ----------
-    lyapunov : ndarray, shape (*grid,)
+    lyapunov : ndarray, shape (...,)
         Estimate of the largest Lyapunov exponent. For MEGNO: twice the slope of its mean against t, by least squares.
-    exponents : ndarray, shape (*grid, k)
+    exponents : ndarray, shape (..., k)
         Of `lyapunov_spectrum`: estimates of all exponents, the largest first.
-    megno : ndarray, shape (*grid,)
+    megno : ndarray, shape (...,)
         Of `megno`: the mean MEGNO at the end of each orbit, 2 for a regular orbit; for a chaotic one it grows like half
         the largest exponent times t. These three are nan for orbits that failed.
-    status : ndarray of str, shape (*grid,)
+    status : ndarray of str, shape (...,)
         "ok"; the name of the event function that ended an orbit, such as "escaped" or "collided"; or "failed".
-    t : ndarray, shape (m, *grid)
+    t : ndarray, shape (m, ...)
         Times: the start, and the ends of the segments; nan after the end of an orbit.
-    running : ndarray, shape (m, *grid, k)
+    running : ndarray, shape (m, ..., k)
         Estimates of the exponents at these times, in the order of the columns, nan at the start.
-    Y, mean : ndarray, shape (m, *grid)
+    Y, mean : ndarray, shape (m, ...)
         Of `megno`: MEGNO at these times, and its mean from the start to these times.
-    y, columns : ndarray, shape (*grid, n) and (*grid, n, k)
+    y, columns : ndarray, shape (..., n) and (..., n, k)
         States at the ends of the orbits, and the orthonormal tangent vectors there, as columns.
-    trusted, message : ndarray of bool and of str, shape (*grid,)
+    trusted, message : ndarray of bool and of str, shape (...,)
         Whether an orbit is reliable, as for `integrate`, and the reason for its end.
     success : bool
         True if no orbit failed.
@@ -113,7 +113,7 @@ class _Orbits:
         self.names = [getattr(event, "__name__", f"event {k}") for k, event in enumerate(events)]
 
     def follow(self, vectors: Array, every: Any, progress: bool, samples: int = 0) -> ChaosResult:
-        """Follow the orbits with vectors (n, k) or (*grid, n, k) in segments of the length `every`."""
+        """Follow the orbits with vectors (n, k) or (..., n, k) in segments of the length `every`."""
         shape, length = vectors.shape[-2:], abs(self.span[1] - self.span[0])
         self.vectors = np.broadcast_to(vectors, (*self.grid, *shape)).reshape(-1, *shape).copy()
         self.log_sizes, self.samples = np.zeros((len(self.y), shape[1])), samples
@@ -254,7 +254,7 @@ def lyapunov_spectrum(
         As for `integrate`.
     t : float or (float, float), optional
         End, or start and end. Default: the interval of the problem.
-    y0s : array_like, shape (*grid, n), optional
+    y0s : array_like, shape (..., n), optional
         Initial states of a grid of orbits, or of one orbit (n,). Default: the initial state of the problem.
     count : int, optional
         Number of exponents to compute, which are the largest ones. Default: all n.
@@ -265,7 +265,7 @@ def lyapunov_spectrum(
         Show a progress bar.
     **options
         Options of `ensemble`: method, steps, invariants, events, executor and so on; `params` may be an array
-        (*grid, p). Name terminal events as their orbits are to be marked, such as ``escaped`` or ``collided``.
+        (..., p). Name terminal events as their orbits are to be marked, such as ``escaped`` or ``collided``.
 
     Returns
     -------
@@ -324,7 +324,7 @@ def megno(
     ----------
     fun, t, y0s, progress, **options
         As for `lyapunov_spectrum`.
-    deviation : array_like, shape (n,) or (*grid, n), optional
+    deviation : array_like, shape (n,) or (..., n), optional
         The tangent vector at the start; its length does not matter. Default: a random direction, the same each time.
     every : float, optional
         Time after which the vector is scaled to length 1 again, and MEGNO is returned. Default: a hundredth of the

@@ -40,7 +40,7 @@ class BodiesProblem(Problem):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name: "gm_" and the name of each body, then the constants of the forces."""
+        """Values of the parameters by name: ``gm_`` and the name of each body, then the constants of the forces."""
         names = [*(f"gm_{name}" for name in self.bodies), *(ENTRIES if self.forces else ())]
         return dict(zip(names, np.asarray(self.params).tolist(), strict=True))
 
