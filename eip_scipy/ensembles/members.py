@@ -260,6 +260,18 @@ class BatchRunner:
         if np.isnan(self._driver.run.diagnostics.max_correction):  # the method has no error estimate
             out["max_correction"][arrived] = np.nan
         BUILD.call(self._judge, arrived, each, out)
+        if self._plan.events and self._driver.run.problem.variations is not None:
+            self._differentiate_events(np.flatnonzero(out["status"] >= 0), each, out)
+
+    def _differentiate_events(self, arrived: np.ndarray, each: data.Members, out: dict[str, Any]) -> None:
+        """Store the derivatives at the events of the members `arrived`, and remarks on those that are missing."""
+        for k in arrived.tolist():
+            self._driver.params[:] = each.params[k]
+            problem, t0 = self._driver.run.problem, self._plan.t0
+            found, remarks = event_derivatives(problem, t0, out["t_events"][k], out["y_events"][k])
+            for name, value in found.items():
+                out[name][k] = value
+            out["message"][k] = "; ".join([out["message"][k], *remarks])
 
     def _inputs(self, y0s: np.ndarray, params: np.ndarray, out: dict[str, Any]) -> data.Members:
         """Return the inputs of the members and the buffers for their results."""

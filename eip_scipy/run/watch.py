@@ -43,7 +43,7 @@ class Watch:
         with progress_bar(self._progress, lambda: shown) as self._bar:
             sol = solve(fun, t_span, y0, method=self._watched(method), **options)
             if self._bar is not None:
-                self._bar.update(abs(self._solver.t - self._t0) - self._bar.n)
+                self._bar.update(abs(float(sol.t[-1]) - self._t0) - self._bar.n)
         if sol.sol is not None and method in (BDF, LSODA):  # which SciPy recognises by their classes
             sol.sol = OdeSolution(sol.sol.ts, sol.sol.interpolants, alt_segment=True)
         states = np.transpose(sol.y)
@@ -56,15 +56,19 @@ class Watch:
     def _watched(self, method: Any) -> Any:
         """Return a subclass of a solver that asks before each step whether to go on."""
 
+        def start(solver: Any, *given: Any, **options: Any) -> None:
+            self._solver = solver  # which makes no step over an interval of no length
+            method.__init__(solver, *given, **options)
+
         def step(solver: Any) -> tuple[bool, str | None]:
             reason = self._before_step(solver)
             return (False, reason) if reason else method._step_impl(solver)
 
-        return type(method)(method.__name__, (method,), {"_step_impl": step})
+        return type(method)(method.__name__, (method,), {"__init__": start, "_step_impl": step})
 
     def _before_step(self, solver: Any) -> str:
         """Report the points saved in the last step; return the reason why no further step is made, or ""."""
-        self._solver, t = solver, float(solver.t)
+        t = float(solver.t)
         if self._bar is not None:
             self._bar.update(abs(t - self._t0) - self._bar.n)
         if self._callback is not None and self._times is None:
@@ -87,5 +91,5 @@ class Watch:
             residuals = NOTHING
             if isinstance(self._solver, EIPSolver):
                 invariants = self._solver._run.invariants
-                residuals = invariants.values(float(t), y) - invariants.fixed_target
+                residuals = invariants.values(float(t), np.ascontiguousarray(y)) - invariants.fixed_target
             self._stopped = bool(self._callback(float(t), np.array(self._tangents.state(y)), residuals))

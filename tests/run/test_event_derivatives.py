@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy.special import ellipe, ellipk
 
 from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate, load
@@ -44,6 +45,17 @@ def test_half_periods_of_a_pendulum_by_its_angle_and_length(options, tmp_path):
     many = ensemble(swing, (0, 30), [[angle, 0.0]] * 2, events=TURNS, **options | {"params": [[1.1], [g_over_l]]})
     for name in ("tangent_events", "time_derivatives", "state_derivatives"):
         np.testing.assert_array_equal(many[name][1][0], run[name][0])
+
+
+def test_members_with_compiled_events_have_those_of_single_runs():
+    function, event = njit(lambda t, y: np.array([y[1], -np.sin(y[0])])), njit(lambda t, y: y[1])
+    options = {"method": EIPDOP853, "h": 0.05, "variations": "state", "events": event}
+    many = ensemble(function, (0, 20), [[1.0, 0.0], [2.0, 0.3]], **options)
+    for member, start in enumerate([[1.0, 0.0], [2.0, 0.3]]):
+        one = integrate(function, (0, 20), start, **options)
+        for name in ("tangent_events", "time_derivatives", "state_derivatives"):
+            assert len(one[name][0]) > 3
+            np.testing.assert_array_equal(many[name][member][0], one[name][0])
 
 
 def attracted(t, y, p=(1.0,)):

@@ -303,6 +303,14 @@ def test_results_pickle_copy_and_print():
     assert "energy" in repr(sol)
 
 
+@pytest.mark.parametrize(("end", "times"), [(5, np.linspace(0, 5, 21)), (0, None)])
+def test_a_callback_gets_several_points_at_once(end, times):
+    found = []
+    call = {"args": (K,), "t_eval": times, "callback": lambda t, y, residuals: found.append((t, *y))}
+    sol = solve_ivp(spring, (0, end), [1.0, 0.0], **call)
+    np.testing.assert_array_equal(np.array(found).T, [sol.t, *sol.y])
+
+
 def test_the_signature_is_scipys_with_the_options():
     shown, scipys = (list(inspect.signature(f).parameters) for f in (solve_ivp, scipy.integrate.solve_ivp))
     assert shown[: len(scipys) - 1] == scipys[:-1]
