@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from llvmlite import ir
-from numba import njit
 from numba.core.compiler_lock import global_compiler_lock
 
-if TYPE_CHECKING:
-    from .numba_bridge import Compiled
+from .numba_bridge import Compiled, serial
 
 __all__ = ["in_one_pass"]
 
@@ -21,8 +18,6 @@ DERIVATIVE, VALUES, GRADIENTS = 1, 2, 4
 WANTED = (DERIVATIVE + VALUES + GRADIENTS, VALUES + GRADIENTS, DERIVATIVE + VALUES, VALUES)
 NUMBER, STATUS = ir.DoubleType(), ir.IntType(32)
 NUMBERS = NUMBER.as_pointer()
-# Counter for the names of C functions.
-_serial = count()
 NOT_FILLED = ir.Constant(NUMBER, math.nan)
 
 
@@ -34,8 +29,8 @@ def in_one_pass(rhs: Compiled, inv: tuple[Compiled, ...], grad: tuple[Compiled, 
     one of them raises. The optimizer sees them all, and that the arrays do not overlap. The values have the same bits
     as those of the functions one by one. Entries that a function leaves as they are become NaN.
     """
-    name = f"eip_scipy.in_one_pass.{next(_serial)}"
-    library = njit(lambda: None).targetctx.codegen().create_library(name)
+    name = f"eip_scipy.{next(serial)}"
+    library = rhs.library.codegen.create_library(name)
     module = library.create_ir_module(name)
     function = ir.Function(module, ir.FunctionType(STATUS, [NUMBER, *[NUMBERS] * 5, STATUS]), name)
     t, y, f, values, G, params, wanted = function.args

@@ -20,10 +20,10 @@ from ..engine.native import LibraryFunction
 from .arrays_into_out import into_out
 from .functions import ChangedShapeError, Kind, NotCompilableError
 
-__all__ = ["Compiled", "compiled", "compiled_or_none", "jitted_call"]
+__all__ = ["Compiled", "compiled", "jitted_call", "serial"]
 
 # Counter for the names of C functions.
-_serial = count()
+serial = count()
 # How a number of each type in `scalars` is read from params.
 SCALARS = {"d": "params[{}]", "q": "int(params[{}])", "?": "params[{}] != 0"}
 # Statements that write `value` to `out`, by the number of dimensions; "values" are those of invariants, also in a list.
@@ -118,7 +118,7 @@ def _c_function(compiled: Any, kind: Kind) -> tuple[int, Any]:
 
     Numba's `cfunc` would take twice as long to compile, and each call would go through another function.
     """
-    name = f"eip_scipy.{next(_serial)}"
+    name = f"eip_scipy.{next(serial)}"
     context = compiled.target_context
     library = context.codegen().create_library(name)
     module = library.create_ir_module(name)
@@ -167,15 +167,6 @@ def _with_all_arguments(fun: Any, kind: Kind, jit: Any, *, into: bool = False) -
     text = "\n    ".join(["def call(t, y, f, out, params):", f"value = fun({', '.join(given)})", *put])
     (code,) = (item for item in compile(text, "<call>", "exec").co_consts if isinstance(item, CodeType))
     return jit(FunctionType(code, {"fun": fun, "ChangedShapeError": ChangedShapeError}))
-
-
-@lru_cache(maxsize=256)
-def compiled_or_none(fun: Any, kind: Kind) -> Compiled | None:
-    """Return a Numba function as a C function, see `compiled`, or None if it does not compile."""
-    try:
-        return compiled(fun, kind, fun.__name__)
-    except NotCompilableError:
-        return None
 
 
 @cache

@@ -149,10 +149,9 @@ class _Restart:
             raise ValueError("continue_to: jacobian belongs to a run with derivatives (variations=...). Omit it.")
         if tangents is None and not (keeps and len(new["invariants"])):
             return new  # nothing passes through the change
-        request = RunArguments.of(**new | {"variations": None, "jvp": None, "symplectic": None})
-        problem, projection = as_problem(request, request.method.TABLEAU, request.method)
+        problem, items = _bound(new)
         if keeps:
-            new["invariants"] = self._retargeted(problem, projection.invariants)
+            new["invariants"] = self._retargeted(problem, items)
         if isinstance(tangents, TangentVectors):
             new |= {"variations": self._passed(tangents, problem), "symplectic": False}  # the change need not be
         return new
@@ -179,7 +178,7 @@ class _Restart:
     def _retargeted(self, problem: BoundProblem, items: tuple[Invariant, ...]) -> tuple[Invariant, ...]:
         """Return the invariants with new targets where the change has changed their values."""
         kept, t, y = self.asked["invariants"], self.origin.t, self.new["y0"]
-        values = [np.ravel(item.function(t, y.copy(), *item.args, *problem.extra)) for item in items]
+        values = _values(problem, items, t, y)
         after, before = np.concatenate([*values, np.zeros(0)]), self.origin.values()
         terms = np.where(np.isfinite(self.origin.terms), self.origin.terms, 0.0)
         sizes = np.maximum(np.maximum(np.abs(before), np.abs(after)), terms)
@@ -238,6 +237,18 @@ class _Restart:
         return J
 
 
+def _bound(arguments: dict[str, Any]) -> tuple[BoundProblem, tuple[Invariant, ...]]:
+    """Return the right-hand side and the invariants of a run with these arguments of `integrate`, without vectors."""
+    request = RunArguments.of(**arguments | {"variations": None, "jvp": None, "symplectic": None})
+    problem, projection = as_problem(request, request.method.TABLEAU, request.method)
+    return problem, projection.invariants
+
+
+def _values(problem: BoundProblem, items: Sequence[Invariant], t: float, y: Array) -> list[Array]:
+    """Return the values of each invariant at a state."""
+    return [np.ravel(item.function(t, y.copy(), *item.args, *problem.extra)) for item in items]
+
+
 def with_functions(result: IntegrationResult, options: dict[str, Any]) -> tuple[Origin, dict[str, Any]]:
     """Return the origin of a result, and the options that remain; a loaded result takes its functions from these."""
     origin: Origin | None = vars(result).get("_origin")
@@ -269,14 +280,12 @@ def with_functions(result: IntegrationResult, options: dict[str, Any]) -> tuple[
     if (events := options.get("events")) is not None and len(as_events(events)) == len(result.t_events or ()):
         arguments["events"] = options.pop("events")  # the same again, which go on counting
     method: Any = options.get("method") or arguments["method"] or default_method(given["fun"])
-    plain = {"method": method, "t_span": (origin.t, origin.t + origin.sign), "y0": origin.y, "variations": None}
-    request = RunArguments.of(**arguments | plain | {"symplectic": None})
-    problem, projection = as_problem(request, method.TABLEAU, method)
-    f = problem.derivative(origin.t, origin.y)
-    values = [np.ravel(x.function(origin.t, origin.y.copy(), *x.args, *problem.extra)) for x in projection.invariants]
-    _require_stored(origin, f, values)
+    at_end = {"method": method, "t_span": (origin.t, origin.t + origin.sign), "y0": origin.y}
+    problem, items = _bound(arguments | at_end)
+    values = _values(problem, items, origin.t, origin.y)
+    _require_stored(origin, problem.derivative(origin.t, origin.y), values)
     parts = np.split(stored["targets"], np.cumsum([value.size for value in values], dtype=int))[:-1]
-    items = with_targets(projection.invariants, [None if np.isnan(x).any() else x for x in parts])
+    items = with_targets(items, [None if np.isnan(x).any() else x for x in parts])
     origin = origin._replace(
         arguments=arguments, loaded=None, kept=lambda: items, values=lambda: np.concatenate([*values, np.zeros(0)])
     )

@@ -566,7 +566,7 @@ nb::object new_work(int64_t n, nb::handle dtype, int64_t stages, int64_t invaria
     work.fields(maker);
     fill(work.sigma, 1.0, work.m);
     for (int64_t i = 0; i < work.l; ++i) work.figures(i)[TERMS] = ENDLESS;
-    // What `Work(*arrays)` does, without its function in Python.
+    // Does what `Work(*arrays)` does, without its function in Python.
     return nb::handle(reinterpret_cast<PyObject *>(&PyTuple_Type)).attr("__new__")(work_type, maker.arrays);
 }
 

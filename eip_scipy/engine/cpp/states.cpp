@@ -90,7 +90,7 @@ Array states_near(nb::handle y, nb::handle sizes, nb::handle ways) {
     return out;
 }
 
-// By a QR decomposition with pivots: the column with the largest remainder is next.
+// Uses a QR decomposition with pivots: the column with the largest remainder is next.
 bool are_independent(nb::handle matrix) {
     int64_t m = 0, n = 0;
     const auto *F = memory<const double>(matrix, "F", NPY_DOUBLE, Bound{m}, Bound{n});

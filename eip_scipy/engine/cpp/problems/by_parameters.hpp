@@ -1,8 +1,8 @@
 // Derivatives of the functions of bodies by their parameters: differences of order 6, which round-off alone limits.
 //
-// All functions of three or more bodies are polynomials of degree 2 in each G m but the first, so that their differences may be
-// as long as the largest G m. The recoil of drag and the invariants of two bodies with "1pn" are not. Such a function is bound to the parameters of a run, then the indices of those by which it is
-// differentiated, and their number.
+// All functions of three or more bodies are polynomials of degree 2 in each G m but the first, so that their differences may
+// be as long as the largest G m. The recoil of drag and the invariants of two bodies with "1pn" are not polynomials. Such a
+// function is bound to the parameters of a run, the indices of those by which it is differentiated, and their number.
 #pragma once
 
 #include <algorithm>
@@ -30,8 +30,8 @@ struct BoundParameters {
     // Adds to out the derivative by parameter k of the `size` numbers that FUNCTION fills.
     template <void (*FUNCTION)(const Given<double> &)>
     void add_derivative(const Given<double> &g, int64_t n, double index, int64_t size, double *out) const {
-        constexpr double WEIGHTS[] = {3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0};
         if (!(0.0 <= index && index < n_params) || n != 6 * bodies) return std::fill_n(out, size, std::nan("")), void();
+        constexpr double WEIGHTS[] = {3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0};
         const auto k = static_cast<int64_t>(index);
         std::vector<double> changed(params, params + n_params), value(size);
         const double own = changed[k], largest = *std::max_element(params, params + bodies);
@@ -62,7 +62,7 @@ void variational_by_parameters(const Given<double> &g) {
     for (int64_t i = 0; i < rows; ++i) std::copy_n(out.data() + n * i, n, g.out + size * i);
 }
 
-// Of the NUMBERS that FUNCTION fills, (NUMBERS, parameters).
+// Fills the derivatives (NUMBERS, parameters) of the numbers that FUNCTION fills.
 template <int64_t EXTRA, void (*FUNCTION)(const Given<double> &), int64_t NUMBERS>
 void value_by_parameters(const Given<double> &g) {
     const BoundParameters bound = BoundParameters::of<EXTRA>(g);
