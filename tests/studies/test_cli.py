@@ -1,4 +1,4 @@
-"""The command line and what all studies share: exit statuses, options, files."""
+"""The command line and what all studies share: exit statuses, options, files; the check of an installation."""
 
 import inspect
 import json
@@ -12,7 +12,7 @@ import pytest
 
 import eip_scipy
 from eip_scipy import ProjectionWarning
-from eip_scipy_studies import report
+from eip_scipy_studies import doctor, report
 from eip_scipy_studies.cli import COMMANDS, main
 from eip_scipy_studies.output import Output, parser, run
 
@@ -93,14 +93,6 @@ def test_without_matplotlib_the_rest_is_done(tmp_path, capsys):
     assert 'no figures without matplotlib: pip install "eip_scipy[plot]"' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("words", ["--upto two", "--then else", "--many"])
-def test_wrong_options(words, capsys):
-    with pytest.raises(SystemExit) as left:
-        run("sums", sums, words.split())
-    assert left.value.code == 2
-    assert "sums" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("words", "status"),
     [
@@ -112,6 +104,9 @@ def test_wrong_options(words, capsys):
         (["solar-system", "--resume"], 2),
         (["solar-system", "truth"], 2),
         (["hard-cases", "--out", "/dev/null/folder"], 2),
+        *((["hard-cases", wrong], 2) for wrong in ("--rtol=0", "--rtol=nan", "--rtol=one", "--rtol=1e-20")),
+        (["hard-cases", "--cases", "nobody"], 2),
+        (["doctor", "--many"], 2),
     ],
 )
 def test_status_of_words(words, status, capsys):
@@ -123,24 +118,13 @@ def test_status_of_words(words, status, capsys):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_is_a_function_whose_options_are_described(name):
+    assert len(COMMANDS) <= 12
     module, _, function = COMMANDS[name][0].partition(":")
     study = getattr(import_module(f"eip_scipy_studies.{module}"), function)
     described = parser(name, study).format_help()
     for option in list(inspect.signature(study).parameters)[1:]:
         assert option.replace("_", "-") in described.lower()
     assert "eip_results" in described
-
-
-def test_commands_are_at_most_twelve():
-    assert len(COMMANDS) <= 12
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_small_run_of_the_metric(tmp_path):
-    assert main(["bench", "metric", "--only", "gear", "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "metric.csv").exists()
 
 
 def test_numbers_as_text():
@@ -153,3 +137,26 @@ def test_json_has_no_nan_and_no_numpy(tmp_path):
     content = {"a": np.array([1.0, np.nan]), "b": np.int64(3), 4: (np.bool_(True),)}
     file = report.write_json(tmp_path / "x.json", content)
     assert json.loads(file.read_text()) == {"a": [1.0, None], "b": 3, "4": [True]}
+
+
+def test_an_installation_that_works(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("eip_scipy.core.config.EXTRAS", {"no_such_module": ("plot", "figures")})
+    file = tmp_path / "doctor.json"
+    assert main(["doctor", "--json", str(file)]) == 0
+    text = capsys.readouterr().out
+    assert text.count(" ok") == len(doctor.CHECKS)
+    assert "no_such_module  absent: pip install 'eip_scipy[plot]'" in text
+    found = json.loads(file.read_text())
+    assert all(check["passed"] for check in found["checks"])
+    assert found["installation"] == eip_scipy.show_config("dicts")
+    assert found["installation"]["engine"]["build"] in text
+
+
+@pytest.mark.parametrize("measure", [lambda: 2.0, lambda: float("nan"), lambda: 1 / 0])
+def test_an_installation_that_does_not(measure, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "CHECKS", (*doctor.CHECKS[:1], ("sums", 1.0, measure)))
+    assert main(["doctor"]) == 1
+    shown = capsys.readouterr()
+    assert "FAILED" in shown.out
+    assert shown.out.count(" ok") == 1
+    assert "failed: sums." in shown.err

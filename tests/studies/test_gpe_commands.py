@@ -1,7 +1,6 @@
-"""`eip-scipy gpe` and `reproduce fig-efficiency` on small grids: numbers, checks, files, and mistakes of users."""
+"""`eip-scipy gpe` on small grids: numbers, checks, files, and mistakes of users."""
 
 import csv
-import json
 from dataclasses import replace
 from itertools import count
 
@@ -11,7 +10,7 @@ import pytest
 from eip_scipy import integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
 from eip_scipy_studies.cli import main
-from eip_scipy_studies.condensates import efficiency, quench, states, vortices
+from eip_scipy_studies.condensates import quench, states, vortices
 from eip_scipy_studies.condensates.ground_state import GroundState, ground_state, imprint
 from eip_scipy_studies.condensates.problems import quartic_trap
 from eip_scipy_studies.output import Output
@@ -43,9 +42,6 @@ def test_trap(tmp_path, capsys, monkeypatch):
     assert "lowest of 2 starts" in capsys.readouterr().out
     items = [known(3.190426), known(3.190437), known(3.1), known(3.1, converged=False)]
     assert [check[-1] for check in states.checks({"trap": items})] == [True, False, True, False]
-
-
-# The dynamics.
 
 
 def small_ring(kappa=0.3):
@@ -120,25 +116,6 @@ def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, star
     assert read(tmp_path / "second" / "ring.csv") == read(tmp_path / "whole" / "ring.csv")
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_vortex_lines(tmp_path, monkeypatch, capsys):
-    out, file, folder = tmp_path / "out", tmp_path / "lines.json", tmp_path / "kept"
-    command = ["gpe", "vortex-lines", "--points", "40", "--t-end", "0.2", "--checkpoint", str(folder)]
-    command += ["--out", str(out), "--json", str(file)]
-    assert main(command) == 0
-    names = {"vortex-lines.csv", *(f"vortex-lines-{name}.png" for name in ("slices", "surfaces", "errors"))}
-    assert {path.name for path in out.iterdir()} == names
-    content, before = json.loads(file.read_text()), read(out / "vortex-lines.csv")
-    assert content["vortices"] == [4] * 21
-    assert len(content["checks"]) == 11
-    # The runs are done. Without scikit-image the surfaces are missing, and nothing else.
-    monkeypatch.setattr(quench, "find_spec", lambda name: None)
-    assert main([*command, "--resume"]) == 0
-    assert 'pip install "eip_scipy[surfaces]"' in capsys.readouterr().err
-    assert read(out / "vortex-lines.csv") == before
-
-
 def test_vortices_are_followed_by_where_they_were_going(monkeypatch):
     """Turns of more than half the distance between two vortices, once they have got so fast little by little."""
     turns = np.cumsum([0.01, 0.03, 0.05, 0.07, 0.09, 0.1])
@@ -169,32 +146,3 @@ def test_states_that_do_not_belong(start, tmp_path):
             states.load_state(file, gpe)
     file.write_bytes(b"PK\x03\x04 torn")
     assert main(["gpe", "ring", "--start", str(file), "--out", str(tmp_path), "--quiet"]) == 2
-
-
-# The test of efficiency.
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_efficiency(tmp_path):
-    """On 16 x 16 points, where the modulated wave is resolved to 1e-3: the errors are those of the steps alone."""
-    out = Output(tmp_path, quiet=True)
-    efficiency.efficiency(out, points=16, repeats=1)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "fig-efficiency.csv",
-        "fig-efficiency.png",
-        "fig-efficiency-steps.png",
-    }
-    assert out.passed, out.numbers["checks"]
-    rows = read(tmp_path / "fig-efficiency.csv")
-
-    def column(wave, method, key):
-        return np.array([float(row[key]) for row in rows if (row["wave"], row["method"]) == (f"{wave} wave", method)])
-
-    for name in ("Strang", "splitting4-EIP"):
-        assert column("plane", name, "error_max").max() < 1e-12
-    for name, kept, lost in (("EIP-M", "mass", "energy"), ("EIP-E", "energy", "mass")):
-        worst = [column("modulated", name, f"error_{item}").max() for item in (kept, lost)]
-        assert worst[0] < 1e-12 < worst[1]
-    np.testing.assert_allclose(column("plane", "SAV/CN", "pairs") * column("plane", "SAV/CN", "h"), 1, rtol=0.05)
-    assert any("rank 1" in row["remark"] for row in rows if row["method"] == "EIP-ME")

@@ -66,6 +66,8 @@ def test_ring(ground, tmp_path):
 def test_vortex_lines(tmp_path):
     """To t = 0.4 the energies of the two states, the four lines, their sense and angle are checked by the command."""
     assert main(["gpe", "vortex-lines", "--t-end", "0.4", "--out", str(tmp_path), "--quiet"]) == 0
+    names = {"vortex-lines.csv", *(f"vortex-lines-{name}.png" for name in ("slices", "surfaces", "errors"))}
+    assert {path.name for path in tmp_path.iterdir()} == names
     with open(tmp_path / "vortex-lines.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     for name, (_, _, _, whole) in printed_tables(PAGE)[LINES].items():
@@ -78,6 +80,7 @@ def test_efficiency(tmp_path):
     assert out.passed, out.numbers["checks"]
     with open(tmp_path / "fig-efficiency.csv", newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["wave"] == "modulated wave"]
+    assert any("rank 1" in row["remark"] for row in rows if row["method"] == "EIP-ME")
     for name, (h, error, mass, energy, pairs, _) in printed_tables(PAGE)[EFFICIENCY].items():
         row = min((row for row in rows if row["method"] == name), key=lambda row: abs(float(row["h"]) - float(h)))
         assert_printed(h, float(row["h"]))

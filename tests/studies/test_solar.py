@@ -60,24 +60,6 @@ def test_short_run_with_everything(tmp_path, capsys, monkeypatch):
     assert (content["command"], content["trusted"], len(content["checks"])) == ("solar-system", True, 4)
 
 
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_one_year_against_the_stored_states(tmp_path, monkeypatch):
-    pytest.importorskip("rebound")
-    monkeypatch.setattr(command, "FIGURES", ())
-    status, rows = solar(tmp_path, "--years", "1")
-    assert status == 0
-    assert {row["reference"] for row in rows["solar-system"]} == {"stored states"}
-    mercury = {row["method"]: abs(float(row["longitude_Mercury_rad"])) for row in rows["solar-system"]}
-    assert mercury["IAS15"] < 1e-12
-    assert mercury["EIPRKN12"] < 1e-9
-    assert mercury["EIPGJ14"] < 1e-11
-    assert mercury["SV"] == pytest.approx(0.05, rel=0.5)
-    steps = {row["method"]: row["step_yr"] for row in rows["solar-system"]}
-    assert float(steps["EIPGJ14"]) == 0.1 / 60
-    assert float(steps["EIPRKN12"]) == 0.1 / 7  # of the steps that divide the time between saved states
-
-
 @pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_methods")
