@@ -1,5 +1,6 @@
 """Names that `import eip_scipy` provides, and names that are loaded on first use."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -83,6 +84,14 @@ def test_no_folder_or_module_has_a_public_name():
     """Importing such a module would replace the function, which is only available by its name."""
     here = Path(eip_scipy.__file__).parent
     assert {path.stem for path in here.iterdir()} & {*eip_scipy.__all__} == set()
+
+
+@pytest.mark.parametrize(("package", "extra"), [("rebound", "rebound"), ("astropy", "astro")])
+def test_a_missing_package_says_how_to_get_it(package, extra, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"eip_scipy.integrations.{package}", raising=False)
+    with pytest.raises(ImportError, match=rf'pip install "eip_scipy\[{extra}\]"'):
+        importlib.import_module(f"eip_scipy.integrations.{package}")
 
 
 def test_no_other_name_is_looked_for_in_the_studies():

@@ -15,8 +15,6 @@ from scipy.integrate import solve_ivp
 
 from eip_scipy import (
     EIPDOP853,
-    EIPRK1,
-    EIPRK2,
     EIPRK3,
     EIPRK4,
     EIPRK5,
@@ -29,18 +27,15 @@ from eip_scipy import (
     ProjectionWarning,
     ensemble,
     integrate,
-    project,
 )
 from eip_scipy.problems import kepler, nbody
 from eip_scipy_studies.cli import main
-from eip_scipy_studies.output import Output
 from eip_scipy_studies.trust import command
 from eip_scipy_studies.trust.runs import carry_out
 from eip_scipy_studies.trust.systems import case, compiled_pendulum, mechanics, two_oscillators
 from eip_scipy_studies.trust.table import all_runs
 
 RUNS = all_runs()
-EVERY_CLASS = [EIPRK1, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853, EIPRKN8, EIPRKN12]
 SQUARE = Invariant(lambda t, y: 0.5 * float(y @ y), lambda t, y: y, name="square")
 REST = (2.0, 0.0)
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "trust.md"
@@ -80,14 +75,14 @@ def test_382_faulty_and_679_correct_runs():
     assert len(RUNS) == 382 + 679
 
 
-@pytest.mark.parametrize("run", [run for run in RUNS if run.way != "ensemble"][3::29], ids=lambda run: run.name)
+@pytest.mark.parametrize("run", [run for run in RUNS if run.way != "ensemble"][3::19], ids=lambda run: run.name)
 def test_some_of_the_runs(run):
     outcome = carry_out(run)
     assert bool(outcome.told) == bool(run.faulty), outcome.message
 
 
-def test_the_command_counts_and_its_checks_can_fail(tmp_path, monkeypatch, capsys):
-    """The last state of a faulty run is known, and a correct one is compared with one without projection."""
+def test_the_command_counts(tmp_path, capsys):
+    """A run that is called faulty and is correct is silent."""
     assert main(["trust", "--only", "fall with drag 0.1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "faulty runs are reported: 3 of 3" in out
@@ -96,24 +91,6 @@ def test_the_command_counts_and_its_checks_can_fail(tmp_path, monkeypatch, capsy
     found = command.record(replace(right, faulty=True))
     assert found["first"] == command.SILENT
     assert found["error"] < 0.1
-    monkeypatch.setattr(command, "carried_out", lambda numbers: [found])
-    monkeypatch.setattr(command, "processes", lambda count: SameProcess())
-    output = Output(tmp_path)
-    command.trust(output, only=right.name)
-    assert [check["passed"] for check in output.numbers["checks"]] == [False, True]
-
-
-class SameProcess:
-    """Pool of no processes."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *about):
-        return None
-
-    def submit(self, function, part):
-        return type("Future", (), {"result": lambda self: function(part)})()
 
 
 @pytest.mark.nightly
@@ -157,25 +134,6 @@ def test_an_invariant_whose_rate_is_zero_at_the_start(driver, method):
     assert 0 < t <= 20
     assert size > 50
     assert record.message in repr(record)
-
-
-@both
-@pytest.mark.parametrize("method", EVERY_CLASS)
-@pytest.mark.parametrize("metric", ["error", "euclidean"])
-def test_every_class_tells_and_trusts(driver, method, metric):
-    options = {"method": method, "h": 0.02, "metric": metric}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        run, record = driver(spring(10.0, 2.0), **options)
-    assert run.success
-    assert not record.trusted
-    # Local errors of orders 1 and 2 are nearly as large as the changes of the quantity; the check at the start sees it.
-    low = method in (EIPRK1, EIPRK2)
-    assert [w.category for w in caught] == ([UserWarning] if low else [UserWarning, ProjectionWarning])
-    run, record = driver(spring(10.0), **options)
-    assert run.success
-    assert (record.trusted, record.message) == (True, "")
-    assert record.worst[2] < 50
 
 
 @both
@@ -253,13 +211,6 @@ def test_friction_where_the_gradient_is_computed(driver):
         driver(problem, method=EIPRK45, rtol=1e-6, atol=1e-8)
 
 
-def test_project_tells_of_what_it_leaves():
-    far = Invariant(lambda t, y: float(y @ y), lambda t, y: 2 * y, target=1.0, name="length")
-    with pytest.warns(ProjectionWarning, match="left an error of .* in 'length'"):
-        project([3.0, 4.0], far)
-    assert abs(project([0.6, 0.81], far, iterations=3).residual[0]) < 1e-15
-
-
 # --- leaks and kinks that the study does not have ---
 
 LATER = "'energy' is not an invariant of this system: at t=-?[0-9]"
@@ -301,29 +252,6 @@ def test_a_leak_shorter_than_the_spacing_is_found(every, driver):
         run(fun, (0, 20), y0, **options)
 
 
-@pytest.mark.parametrize(("kind", "size"), [("huber", 0.3), ("contact", 100.0), ("backlash", 0.5), ("walls", 120.0)])
-@pytest.mark.parametrize(
-    ("given", "steps"),
-    [
-        (True, {"method": EIPRK4, "h": 0.02}),
-        (True, {"method": EIPRK4, "h": 0.01, "every": 4}),
-        (True, {"method": EIPDOP853, "h": 0.01, "every": "auto"}),
-        (False, {"method": EIPRK5, "h": 0.02}),
-        (False, {"method": EIPRK45, "rtol": 1e-6}),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:invariant 'energy' has no grad and allows no complex step")
-@pytest.mark.filterwarnings("ignore:overflow encountered in scalar power")  # long trial steps in free flight
-def test_kinks_are_no_leaks(given, steps, kind, size):
-    """Estimates of steps over a kink are too small, so that corrections are many times larger; the energy holds."""
-    for start in ([1.0, 0.1], [0.029, -2.3], [0.453, 0.663]):
-        problem = mechanics(kind, start, size=size)
-        if not given:
-            problem = replace(problem, invariants=(Invariant(problem.invariants[0].fun, name="energy"),))
-        run = integrate(problem, **steps)
-        assert run.trusted, run.message
-
-
 def test_close_to_a_pericentre_a_right_gradient_is_right():
     for e in (0.9, 1 - 1e-3, 1 - 1e-6, 1 - 1e-9):
         steps = {"method": EIPDOP853, "h": None, "first_step": 1e-12, "rtol": 1e-10, "compiled": False}
@@ -337,22 +265,6 @@ def with_planet(mass, start, speed):
     """Return a star, a giant planet at 5.2, and a planet."""
     q, v = [[0, 0, 0], [5.2, 0, 0], [start, 0, 0]], [[0, 0, 0], [0, 5.2**-0.5, 0], [0, speed, 0]]
     return nbody([1.0, 1e-3, mass], q, v, t_span=(0.0, 60.0))
-
-
-@pytest.mark.parametrize("mass", [1e-9, 0.0])
-@pytest.mark.parametrize("method", [EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK45, EIPDOP853, EIPRKN8])
-def test_a_step_beyond_the_period_of_a_light_planet(method, mass):
-    """The energy of the system does not show that the planet leaves its orbit. Short steps resolve its motion."""
-    problem = with_planet(mass, 0.2, 0.2**-0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ProjectionWarning)
-        run = integrate(problem, method=method, h=0.27)
-    unresolved = re.search(r"h=0.27 do not resolve the motion of components (6, 7, 8|15, 16, 17) ", run.message)
-    assert not run.trusted
-    assert unresolved or "projection failed" in run.message
-    run = integrate(problem, (0, 10), method=method, h={EIPRK2: 0.005, EIPRK3: 0.01}.get(method, 0.02))
-    assert run.trusted, run.message
-    assert np.linalg.norm(run.y[6:9, -1] - run.y[:3, -1]) == pytest.approx(0.2, rel=0.02)
 
 
 @pytest.mark.parametrize("method", [EIPRK3, EIPRK4, EIPRK5, EIPDOP853, EIPRKN8, EIPRKN12])
@@ -389,25 +301,6 @@ def test_examinations_stay_in_the_interval_and_refuse_nothing():
 
 
 # --- members, checkpoints, loose tolerances ---
-
-
-@pytest.mark.slow
-@pytest.mark.needs_jit
-@pytest.mark.parametrize("method", [EIPRK2, EIPRK4, EIPRK5])
-@pytest.mark.parametrize("together", [False, True], ids=["one by one", "in vectors"])
-def test_each_member_is_judged_by_its_own_checks(method, together, request):
-    """Members 1 to 7 have friction of 1e-4 to 0.1; the others, some of them in a vector with these, have none."""
-    if together:
-        request.getfixturevalue("in_vectors")
-    friction = np.zeros((17, 1))
-    friction[1:8, 0] = np.geomspace(1e-4, 0.1, 7)
-    problem = compiled_pendulum(end=10.0, members=True)
-    with pytest.warns(ProjectionWarning, match="7 of 17 members .* the first of them member 1"):
-        run = ensemble(problem, params=friction, method=method, h=0.02, executor=1)
-    assert run.success
-    assert run.side_by_side.all() == together
-    assert np.flatnonzero(~run.trusted).tolist() == list(range(1, 8))
-    assert all("'energy' is not an invariant" in run.message[k] for k in range(1, 8))
 
 
 @pytest.mark.parametrize("differing", [False, True])
@@ -457,27 +350,6 @@ def test_what_was_found_before_a_checkpoint_is_known_after_it(tmp_path):
     np.testing.assert_array_equal(resumed.y, whole.y)
     assert resumed.diagnostics.worst == whole.diagnostics.worst
     assert resumed.diagnostics.message == whole.diagnostics.message
-
-
-@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
-@pytest.mark.parametrize("rtol", [1e-2, 1e-3])
-@pytest.mark.parametrize(
-    ("name", "params", "start", "end"),
-    [
-        ("rigid_body", (1.0, 2.0, 3.0), (0.0, 1.0, 1.0), 25.0),
-        ("rigid_body", (1.0, 2.0, 3.0), (0.5, 0.7, 0.3), 25.0),
-        ("sir", (1.0, 0.3), (0.9, 0.1, 0.0), 60.0),
-        ("sir", (1.0, 0.3), (0.999, 0.001, 0.0), 60.0),
-    ],
-)
-def test_loose_tolerances_are_no_failure(name, params, start, end, rtol, method):
-    """A step may miss an invariant by a few tolerances; the reference is DOP853 at 1e-11."""
-    problem = case(name, params, start, end)
-    run, record = by_solve_ivp(problem, method=method, rtol=rtol, atol=1e-4)
-    plain, _ = by_solve_ivp(problem, method=method, rtol=rtol, atol=1e-4, invariants=())
-    truth = solve_ivp(problem.fun, problem.t_span, problem.y0, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
-    assert (run.status, record.trusted) == (0, True), record.message
-    assert np.abs(run.y[:, -1] - truth).max() <= 3 * np.abs(plain.y[:, -1] - truth).max() + 10 * rtol
 
 
 @pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])

@@ -100,13 +100,6 @@ def test_generated_functions(number):
     check(number)
 
 
-@pytest.mark.slow
-@pytest.mark.nightly
-def test_two_hundred_generated_functions():
-    for number in range(200):
-        check(number)
-
-
 def test_sizes_errors_and_caches(tmp_path):
     assert called(jitted("return np.array([1.0, 2.0, 3.0, 4])", -1)).tolist() == [1.0, 2.0, 3.0, 4.0]
     with pytest.raises(ValueError, match="an array of another size"):

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import DOP853, LSODA, RK23, RK45, OdeSolver, solve_ivp
 from systems import PENDULUM_ENERGY, pendulum
 
-from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method, integrate
 
 NAMES = ("order", "error_estimator_order", "n_stages", "A", "B", "C", "E", "P")
 
@@ -44,16 +44,6 @@ def test_the_attributes_are_scipy_s(ours, scipy_s):
     for found in (ours, solver):
         for name in NAMES:
             np.testing.assert_array_equal(getattr(found, name), getattr(scipy_s, name))
-
-
-def test_attributes_of_other_methods():
-    assert (EIPRK4.order, EIPRK4.n_stages, EIPRK4.error_estimator_order) == (4, 4, 3)
-    np.testing.assert_allclose(EIPRK4.B, [1 / 6, 1 / 3, 1 / 3, 1 / 6], rtol=1e-15)
-    np.testing.assert_allclose(EIPRK4.A.sum(axis=1), EIPRK4.C, rtol=1e-15)
-    assert EIPRK4.E.shape == (5,)
-    assert (EIPRKN12.order, EIPRKN12.n_stages) == (12, 17)
-    assert EIPGJ12.order == 12
-    assert EIPRKN12.A is NotImplemented
 
 
 def test_a_class_like_scipy_s():

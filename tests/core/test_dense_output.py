@@ -1,20 +1,21 @@
 """Dense output: exactly y_k at t_k, on the manifold in between, of SciPy's orders, and safe brackets for events."""
 
+import copy
 import functools
-import math
+import pickle
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from systems import H_USES_F, SPIN_NORM, SPIN_START, H, L, energy, momentum, orbit, pericentre, spin
 
-from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, eip_method
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invariant, integrate
 from eip_scipy.problems import solar_system
 
 EPS = np.finfo(float).eps
 NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
-OWN = {cls: eip_method(cls.TABLEAU) for cls in PAIRS}
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
 
 Y0 = pericentre(0.6)
@@ -72,8 +73,12 @@ def items_of(variant):
 
 
 @pytest.mark.parametrize(("method", "variant"), CASES)
-def test_exactly_the_steps(method, variant):
-    sol = solved(method, variant)
+def test_steps_and_what_is_between_and_beyond_them(method, variant):
+    """States at the steps are exact, on the level in between, and a function of the time alone.
+
+    The level is linear between the residuals at a step's ends, whatever they are.
+    """
+    items, sol = items_of(variant), solved(method, variant)
     assert sol.status == 0
     assert len(sol.t) > 5
     np.testing.assert_array_equal(np.array([sol.sol(t) for t in sol.t]).T, sol.y)
@@ -86,12 +91,6 @@ def test_exactly_the_steps(method, variant):
     np.testing.assert_array_equal(sol.sol.interpolants[0](sol.t[0]), VARIANTS[variant].get("y0", Y0))
     sol.sol(sol.t)[:] = 99.0  # states that are given out are copies
     np.testing.assert_array_equal(sol.sol(sol.t), sol.y)
-
-
-@pytest.mark.parametrize(("method", "variant"), CASES)
-def test_on_the_level_between_the_ends(method, variant):
-    """The level is linear between the residuals at a step's ends, whatever they are."""
-    items, sol = items_of(variant), solved(method, variant)
     for k in np.unique(np.linspace(0, len(sol.t) - 2, 12).astype(int)):
         piece = sol.sol.interpolants[k]
         ends = [[item.fun(sol.t[j], sol.y[:, j]) for item in items] for j in (k, k + 1)]
@@ -102,17 +101,11 @@ def test_on_the_level_between_the_ends(method, variant):
             np.testing.assert_allclose(found, level, rtol=0, atol=2e-13 * (1 + np.abs(level).max(initial=0.0)))
     if not items and np.isrealobj(sol.y):  # the test above is able to fail
         assert residuals(sol.sol(np.linspace(*sol.t[[0, -1]], 500))).max() > 1e-5 * (method is not EIPDOP853)
-
-
-@pytest.mark.parametrize(("method", "variant"), CASES)
-def test_a_function_of_the_time_also_beyond_the_ends(method, variant):
-    sol = solved(method, variant)
     t = np.random.default_rng(0).permutation(np.linspace(sol.t[0], sol.t[-1], 60))
     together = sol.sol(t)
     assert together.shape == (len(sol.y), 60)
     assert together.dtype == sol.y.dtype
     np.testing.assert_allclose(np.array([sol.sol(s) for s in t]).T, together, rtol=0, atol=3e-15)
-    np.testing.assert_array_equal(sol.sol(t), together)
     low, high = sorted((sol.t[0], sol.t[-1]))
     assert np.abs(sol.sol(low - 0.01) - sol.sol(low)).max() < 0.1
     assert np.isfinite(sol.sol(np.array([low - 3.0, low - 0.01, high + 0.01, high + 3.0]))).all()
@@ -135,66 +128,6 @@ def test_late_calls_do_not_disturb_a_running_solver(method, invariants):
     assert quiet.status == "finished"
     for piece, y in zip(pieces, at_once, strict=True):
         np.testing.assert_array_equal(piece(0.4 * piece.t_old + 0.6 * piece.t), y)
-
-
-# Order of the interpolants: SciPy's.
-
-
-def interpolation_errors(method, h, t_span=(0.0, 1.0), **options):
-    """Return the largest error anywhere, and at the steps, of fixed steps of size h."""
-    problem = {"fun": orbit, "y0": Y0, **options}
-    sol = solve(method, t_span=t_span, h=h, dense_output=True, **problem)
-    t = np.unique(np.concatenate([np.linspace(*t_span, 400), sol.t]))[:: np.sign(t_span[1] - t_span[0]).astype(int)]
-    exact = solve_ivp(problem["fun"], t_span, problem["y0"], method="DOP853", rtol=3e-14, atol=1e-16, t_eval=t)
-    errors = np.abs(sol.sol(t) - exact.y).max(axis=0)
-    return errors.max(), errors[np.isin(t, sol.t)].max()
-
-
-ORDER_OPTIONS = {
-    "plain": {},
-    "H, L, reuse_f off": {"invariants": [H, L], "reuse_f": False},
-    "every 3, euclidean": {"invariants": [H_USES_F, L], "metric": "euclidean", "every": 3},
-    "backward": {"invariants": [H, L], "t_span": (1.0, 0.0)},
-    "complex": {**COMPLEX, "t_span": (0.0, 4.0)},
-}
-
-
-@pytest.mark.parametrize(
-    ("method", "order", "h"), [(EIPRK23, 3, 0.02), (EIPRK45, 4, 0.04), (EIPDOP853, 7, 0.1), (EIPRK4, 4, 0.02)]
-)
-@pytest.mark.parametrize("option", ORDER_OPTIONS)
-def test_order_of_interpolation(method, order, h, option):
-    h, options = h * (4 if option == "complex" else 1), ORDER_OPTIONS[option]
-    coarse, fine = (interpolation_errors(method, step, **options) for step in (h, h / 2))
-    assert fine[0] > 1e-13, "too near to round-off to tell"
-    found, of_steps = (math.log2(a / b) for a, b in zip(coarse, fine, strict=True))
-    assert found > min(order, of_steps) - 0.3, (found, of_steps, coarse, fine)
-    # The interpolant's own O(h^order), not far above that of the steps' plain method.
-    plain = {key: value for key, value in options.items() if key in ("fun", "y0", "t_span")}
-    assert fine[0] <= 2 * fine[1] + 4 * interpolation_errors(method, h / 2, **plain)[0]
-
-
-@pairs
-def test_interpolation_is_as_good_as_scipy_s(method):
-    """Errors between the steps of the plain method are SciPy's, and a projected piece is not much worse than a step."""
-    name = method.__name__.removeprefix("EIP")
-    t = np.linspace(0, 8, 997)
-    exact = solve_ivp(orbit, (0, 8), Y0, method="DOP853", rtol=3e-14, atol=1e-16, t_eval=t).y
-    theirs, own = (np.abs(solve(m, dense_output=True).sol(t) - exact).max() for m in (name, OWN[method]))
-    assert own == pytest.approx(theirs, rel=0.05)
-    (inside, _), (projected, end) = (
-        np.max([piece_errors(*pair) for pair in zip(sol.sol.interpolants, sol.y.T, strict=False)], axis=0)
-        for sol in (solve(OWN[method], dense_output=True, invariants=items) for items in ((), [H, L]))
-    )
-    assert projected < 2.5 * max(inside, end)
-
-
-def piece_errors(piece, y):
-    """Return the largest error inside a step, and that at its end, of the flow from its start."""
-    t = np.linspace(piece.t_old, piece.t, 9)
-    exact = solve_ivp(orbit, (t[0], t[-1]), y, method="DOP853", rtol=1e-12, atol=1e-14, t_eval=t).y
-    errors = np.abs(piece(t) - exact).max(axis=0)
-    return errors.max(), errors[-1]
 
 
 # Events near the ends of steps.
@@ -240,44 +173,6 @@ def test_adversarial_thresholds(method, kind, rtol):
         assert (np.diff(t) * np.sign(sol.t[-1] - sol.t[0]) >= 0).all()
 
 
-@pairs
-def test_thresholds_as_terminal_events(method):
-    """Each ends the run at its own place, exactly on the value."""
-    sol = solve(method, invariants=[H, L])
-    for i, value in thresholds(sol, SHIFTS)[::4]:
-        event = passing(i, value)
-        event.terminal = True
-        found = solve(method, invariants=[H, L], events=event)
-        signs = np.sign(sol.y[i] - value)
-        assert found.status == (signs[:-1] * signs[1:] <= 0).any(), f"component {i} passes {value}"
-        if found.status:
-            assert found.t[-1] == found.t_events[0][-1]
-            np.testing.assert_array_equal(found.y[:, -1], found.y_events[0][-1])
-            assert abs(found.y[i, -1] - value) <= 1e-13
-            assert residuals(found.y[:, -1]).max() <= 1e-7
-
-
-@pytest.mark.parametrize("method", [*PAIRS, *OWN.values()], ids=lambda m: m.__name__)
-@pytest.mark.parametrize("variant", [pytest.param("plain", marks=NIGHTLY), "complex plain"])
-def test_thresholds_without_invariants(method, variant):
-    """SciPy's own RK45 raises here: its interpolant misses the end of a step by an ulp."""
-    sol = solve(method, **VARIANTS[variant])
-    cases = thresholds(sol, (0.0, EPS, -EPS, 1e-12, -1e-12), (0, 1, 2), len(sol.t))
-    found = solve(method, **VARIANTS[variant], events=[passing(*case) for case in cases])
-    np.testing.assert_array_equal(found.y, sol.y)
-    assert sum(len(t) > 0 for t in found.t_events) >= 57
-
-
-@pairs
-def test_an_invariant_as_an_event(method):
-    """The energy itself against its own level: noise crosses it, and no bracket fails."""
-    sol = solve(method, invariants=[H, L])
-    events = [lambda t, y, start=start: energy(t, y) - energy(t, start) for start in sol.y.T[::3]]
-    found = solve(method, invariants=[H, L], events=events)
-    assert found.status == 0
-    assert all(len(t) > 0 for t in found.t_events)
-
-
 # Samples on the manifold.
 
 
@@ -303,3 +198,43 @@ def test_frame_and_blocks(method):
             np.array([np.atleast_1d(item.fun(0.0, state, *item.args)) for state in states.T]) for states in (y, sol.y)
         )
         assert np.abs(between - between[0]).max() <= np.ptp(at_steps, axis=0).max() + 1e-13 * np.abs(between).max()
+
+
+# Pickles have no functions of their run: the interpolant, whose samples are not projected.
+
+TIMES = np.linspace(0, 3, 203)
+PICKLED = {name: {"rtol": 1e-6, "atol": 1e-9} for name in ("EIPRK45", "EIPDOP853", "EIPRKN8", "EIPRKN12", "EIPRadau")}
+PICKLED |= {"EIPRK4": {"h": 0.02}, "EIPGJ12": {"h": 0.008}, "EIPGJ14": {"h": 0.008}}
+
+
+def runs(name, **options):
+    options |= {"method": getattr(eip_scipy, name), "dense_output": True} | PICKLED[name]
+    for solve in (integrate, eip_scipy.solve_ivp):
+        yield solve(lambda t, y: orbit(t, y), (0, 3), Y0, **options)
+
+
+@pytest.mark.parametrize("name", PICKLED)
+def test_without_invariants_it_is_the_same(name):
+    for run in runs(name):
+        found = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(run.sol))))
+        np.testing.assert_allclose(found(TIMES), run.sol(TIMES), rtol=1e-12, atol=1e-13)
+        np.testing.assert_array_equal(found(run.sol.ts), run.sol(run.sol.ts))
+        np.testing.assert_allclose(found(TIMES[5]), found(TIMES)[:, 5], rtol=1e-14, atol=1e-15)  # BLAS sums in two ways
+
+
+@pytest.mark.parametrize("name", PICKLED)
+def test_with_invariants_samples_are_not_projected(name):
+    for run in runs(name, invariants=[H, L]):
+        found, projected = pickle.loads(pickle.dumps(run.sol)), run.sol(TIMES)
+        np.testing.assert_allclose(found(TIMES), projected, rtol=0, atol=1e-4)
+        np.testing.assert_array_equal(found(run.sol.ts), run.sol(run.sol.ts))
+        np.testing.assert_array_equal(copy.deepcopy(run.sol)(TIMES), projected)
+        drift = [max(abs(energy(0, y) - energy(0, Y0)) for y in states.T) for states in (found(TIMES), projected)]
+        assert drift[0] > drift[1] or name.startswith("EIPGJ")
+
+
+@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("factor", [1.0, 1j])
+def test_complex_states_and_odd_numbers_of_components(method, factor):
+    run = integrate(lambda t, y: factor * y, (0, 1), [1.0 * factor], method=method, dense_output=True, rtol=1e-6)
+    np.testing.assert_allclose(pickle.loads(pickle.dumps(run.sol))(TIMES / 3), run.sol(TIMES / 3), rtol=1e-14)

@@ -9,7 +9,7 @@ from systems import jit_energy as energy
 from systems import jit_momentum as momentum
 from systems import jit_orbit as fun
 
-from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate
+from eip_scipy import EIPDOP853, Invariant, integrate
 from eip_scipy.core.invariant_set import InvariantSet
 
 numba = pytest.importorskip("numba")
@@ -163,13 +163,6 @@ def test_the_run_is_compiled_and_its_bits_are_those_of_the_interpreted_one():
     assert BOTH[0].grad is None  # the invariant of the user is left as it was
     assert np.max(result.max_residual) < 1e-11
     np.testing.assert_array_equal(result.y, interpreted.y)
-
-
-def test_ensembles_run_compiled_with_the_same_bits():
-    options = {"method": EIPRK4, "h": 0.01, "invariants": BOTH}
-    result = ensemble(fun, (0, 2), [START, [0.6, 0.0, 0.0, 1.5]], **options)
-    assert np.all(result.status == 0)
-    np.testing.assert_array_equal(result.y[0], integrate(fun, (0, 2), START, **options).y[:, -1])
 
 
 def test_a_function_that_dual_numbers_cannot_take_runs_interpreted_and_says_so():

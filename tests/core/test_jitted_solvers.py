@@ -68,17 +68,6 @@ def test_python_is_not_called_in_the_steps(monkeypatch):
 
 
 @njit
-def of_a_list(t, y):
-    return [y[1], -y[0]]
-
-
-def test_lists_and_integers():
-    for fun in (njit(lambda t, y: np.array([1, 2])), of_a_list):
-        runs = [solve_ivp(f, (0, 1), [0.5, 0.5], method=EIPRK4, h=0.1) for f in (fun, in_python(fun))]
-        assert (runs[0].y == runs[1].y).all()
-
-
-@njit
 def late(t, y):
     if t > 1.0:
         raise ValueError("too late")

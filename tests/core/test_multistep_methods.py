@@ -183,19 +183,6 @@ def test_velocities_are_found_in_solve_ivp():
         solve_ivp(damped, (0, 20), [1.0, 0.0], method=EIPGJ12, h=0.05)
 
 
-def test_solve_ivp():
-    """The states are those at the newest end of the history; events and dense output work as in any solver."""
-    times = np.linspace(0, 20, 101)
-    given = {"method": EIPGJ14, "h": STEP, "jacobian": jacobian, "dense_output": True, "t_eval": times, **KEPT}
-    solution = solve_ivp(orbit, (0, 20), Y0, events=lambda t, y: y[1], **given)
-    assert solution.success
-    assert np.abs(solution.y - exact(times)).max() < 1e-12
-    assert np.abs(solution.sol(times) - exact(times)).max() < 1e-12
-    found = solution.t_events[0][solution.t_events[0] > 1]
-    assert np.allclose(found, np.pi * np.arange(1, found.size + 1), rtol=0, atol=1e-11)
-    assert solution.nfev < 20 / STEP + 700
-
-
 def later_damped(t, y):
     """An oscillator with a damper that begins to act, smoothly, at t = 3; before, other velocities change nothing."""
     c = 0.05 * np.exp(-20.0 / (t - 3.0)) if t > 3.0 else 0.0

@@ -1,6 +1,4 @@
-"""Runge-Kutta-Nystrom methods through solve_ivp and integrate: orders, dense output, bits, and refused arguments."""
-
-from fractions import Fraction
+"""Runge-Kutta-Nystrom methods: orders of steps and samples, events, compensated sums, and refused arguments."""
 
 import numba
 import numpy as np
@@ -8,30 +6,22 @@ import pytest
 from closed_forms import kepler_state
 from orders import observed_order
 from scipy.integrate import solve_ivp
-from systems import JIT_H, JIT_L, orbit
+from systems import JIT_H, JIT_L
 
-from eip_scipy import EIPRKN8, EIPRKN12, Diagnostics, eip_method, integrate
+from eip_scipy import EIPGJ12, EIPRKN8, EIPRKN12, Invariant, eip_method, integrate
 from eip_scipy.methods import NystromTableau
-from eip_scipy.problems import solar_system
+from eip_scipy.problems import kepler
 
 Y0 = np.array([0.8, 0.1, -0.2, 1.1])
 both = pytest.mark.parametrize("method", [EIPRKN8, EIPRKN12])
 
 
-@numba.njit
-def acceleration(t, q):
+def pull(t, q):
     return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
 
 
-@numba.njit
-def fill_acceleration(t, q, out):
-    w = -1.0 / (q[0] ** 2 + q[1] ** 2) ** 1.5
-    out[0], out[1] = w * q[0], w * q[1]
-
-
-INVARIANTS = [JIT_H, JIT_L]
-TAYLOR = NystromTableau("Taylor 2", [[]], ["1/2"], [1], [0], 1, reference="q + h v + h^2 a / 2, v + h a")
-KEPT = {"invariants": INVARIANTS, "blocks": 2}
+acceleration = numba.njit(pull)
+KEPT = {"invariants": [JIT_H, JIT_L], "blocks": 2}
 
 
 @pytest.fixture(scope="module")
@@ -59,38 +49,6 @@ def test_time_reaches_every_stage(method):
         np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
 
 
-@pytest.mark.slow
-@pytest.mark.needs_jit
-@both
-@pytest.mark.parametrize("options", [{"invariants": ()}, KEPT, {**KEPT, "every": 3}, {**KEPT, "every": "auto"}])
-def test_all_ways_give_the_same_bits(method, options):
-    span, h = (0, 3), 0.05
-    end = solve_ivp(orbit, span, Y0, method=method, h=h, **options).y[:, -1]
-    for fun, in_place in ((acceleration, False), (fill_acceleration, True)):
-        given = {"method": method, "h": h, "in_place": in_place, **options}
-        runs = [
-            integrate(acceleration=fun, t_span=span, y0=Y0, compiled=compiled, **given) for compiled in (False, True)
-        ]
-        np.testing.assert_array_equal(runs[0].y, runs[1].y)
-        assert runs[0].nfev == runs[1].nfev
-    np.testing.assert_allclose(runs[0].y[:, -1], end, rtol=0, atol=1e-13)
-
-
-@both
-@pytest.mark.parametrize("backward", [False, True])
-def test_adaptive(method, backward, exact):
-    start, span = (exact, (2, 0)) if backward else (Y0, (0, 2))
-    end = Y0 if backward else exact
-    diagnostics = Diagnostics()
-    sol = solve_ivp(orbit, span, start, method=method, rtol=1e-9, atol=1e-11, diagnostics=diagnostics, **KEPT)
-    assert sol.status == 0
-    np.testing.assert_allclose(sol.y[:, -1], end, rtol=0, atol=2e-8)
-    assert diagnostics.max_residual.max() < 1e-14
-    run = integrate(acceleration=acceleration, t_span=span, y0=start, method=method, rtol=1e-9, atol=1e-11, **KEPT)
-    assert run.compiled != numba.config.DISABLE_JIT
-    np.testing.assert_allclose(run.y[:, -1], sol.y[:, -1], rtol=0, atol=1e-12)
-
-
 @both
 def test_what_is_no_second_order_system(method):
     """The order of the state is wrong, an acceleration depends on the velocity, or the number of components is odd."""
@@ -108,45 +66,6 @@ def test_what_is_no_second_order_system(method):
         integrate(acceleration=lambda t, q: np.zeros(4), t_span=(0, 1), y0=Y0, method=method, h=0.1)
 
 
-@pytest.mark.needs_jit
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "h", [0.02, *(pytest.param(h, marks=[pytest.mark.nightly, pytest.mark.slow]) for h in (1 / 64, 0.01, 0.005))]
-)
-def test_spacing_by_itself_never_spoils_a_small_step(h):
-    """every="auto" over 1000 years: no planet worse than twice without projection, or 3e-8 AU, at no evaluation."""
-    problem = solar_system()
-    reference = problem.reference(1000.0)
-    plain, kept = (
-        integrate(problem, (0, 1000), method=EIPRKN12, h=h, compensated=True, **options)
-        for options in ({"invariants": ()}, {"every": "auto"})
-    )
-    of_plain, of_kept = (
-        np.linalg.norm((run.y[:, -1] - reference)[:30].reshape(10, 3), axis=1)[1:] for run in (plain, kept)
-    )
-    assert np.all(of_kept < np.maximum(2 * of_plain, 3e-8))
-    assert kept.nfev == plain.nfev
-
-
-def test_compensated_sum_of_a_constant_acceleration():
-    """There and back in 3000 steps of a length with many bits, against fractions; one stage leaves no sum to round."""
-    h, steps, a = 0.1, 3_000, np.array([1 / 3, -0.7])
-    v0 = -0.5 * a * (steps * h)
-    last = Fraction(steps * h - (steps - 1) * h)
-    time = (steps - 1) * Fraction(h) + last
-    exact_end = [Fraction(v) * time + Fraction(x) * time**2 / 2 for v, x in zip(v0, a, strict=True)]
-
-    def error(compensated):
-        options = {"h": h, "method": eip_method(TAYLOR), "compensated": compensated, "compiled": False}
-        y = integrate(acceleration=lambda t, q: a, t_span=(0, steps * h), y0=np.concatenate([0 * v0, v0]), **options).y[
-            :2, -1
-        ]
-        return max(abs(float(Fraction(x) - wanted)) for x, wanted in zip(y, exact_end, strict=True))
-
-    assert error(True) < 1e-14
-    assert error(False) > 100 * error(True)
-
-
 def test_auto_projects_where_it_pays():
     """Large steps are projected one and all; small ones, whose error is below round-off, at the end only."""
     counts = []
@@ -155,3 +74,153 @@ def test_auto_projects_where_it_pays():
         counts.append((run.diagnostics.n_projections + run.diagnostics.n_skipped, round(10 / h)))
     assert counts[0][0] == counts[0][1]
     assert counts[1][0] <= 3
+
+
+# Between the steps: samples, dense output and events as accurate as the steps.
+
+STEPS = [{"rtol": 1e-10, "atol": 1e-13}, {"rtol": 1e-12, "atol": 1e-15}, {"h": 0.1}]
+steps = pytest.mark.parametrize("options", STEPS, ids=["1e-10", "1e-12", "fixed"])
+ECCENTRICITY, END = 0.6, 50.0
+TIMES = np.linspace(0.0, END, 501)
+
+
+def logarithmic(t, q):
+    return -np.array([q[0], q[1] / 0.64]) / (0.1 + q[0] ** 2 + q[1] ** 2 / 0.64)
+
+
+def galactic_energy(t, y):
+    return 0.5 * (y[2] ** 2 + y[3] ** 2) + 0.5 * np.log(0.1 + y[0] ** 2 + y[1] ** 2 / 0.64)
+
+
+def apsis(t, y):
+    return y[0] * y[2] + y[1] * y[3]
+
+
+def exact_kepler(t):
+    """Return the orbit from its pericentre at t = 0, by Kepler's equation, as (4, m)."""
+    t, e = np.asarray(t, float), ECCENTRICITY
+    u = t + e * np.sin(t)
+    for _ in range(60):
+        u = u - (u - e * np.sin(u) - t) / (1 - e * np.cos(u))
+    b, r = np.sqrt(1 - e * e), 1 - e * np.cos(u)
+    return np.array([np.cos(u) - e, b * np.sin(u), -np.sin(u) / r, b * np.cos(u) / r])
+
+
+PROBLEM = kepler(ECCENTRICITY, relativistic=0.0)
+KEPLER = {"y0": PROBLEM.y0, "invariants": PROBLEM.invariants}
+GALACTIC = {"y0": np.array([1.0, 0.0, 0.1, 0.8]), "invariants": [Invariant(galactic_energy)]}
+
+
+@pytest.fixture(scope="module")
+def exact_galactic():
+    """Return the galactic orbit by steps so short that both methods and their interpolants agree to 1e-13."""
+    fine = {"h": 0.025, "compensated": True, "dense_output": True, **GALACTIC}
+    return integrate(acceleration=logarithmic, t_span=(0, END), method=EIPRKN12, **fine).sol
+
+
+def field(acceleration):
+    return lambda t, y: np.concatenate([y[2:], acceleration(t, y[:2])])
+
+
+def largest(difference):
+    return np.abs(difference).max()
+
+
+@both
+@steps
+@pytest.mark.parametrize(("orbit", "kept"), [("kepler", True), ("kepler", False), ("galactic", True)])
+def test_samples_are_as_accurate_as_the_steps(method, options, kept, orbit, exact_galactic):
+    """The closed form of Kepler's problem, and a galactic orbit; 501 samples by all ways to them."""
+    fun, acceleration, given, exact = {
+        "kepler": (PROBLEM, pull, KEPLER, exact_kepler),
+        "galactic": (field(logarithmic), logarithmic, GALACTIC, exact_galactic),
+    }[orbit]
+    given = {**given, **options, "method": method} | ({} if kept else {"invariants": ()})
+    run = integrate(fun, (0, END), save_every=1, dense_output=True, **given)
+    assert run.compiled == (orbit == "kepler")
+    error = max(largest(run.y - exact(run.t)), 1e-14)
+    sampled = integrate(fun, (0, END), t_eval=TIMES, **given)
+    assert largest(sampled.y - exact(TIMES)) < 3 * error
+    np.testing.assert_array_equal(run.sol(TIMES), sampled.y)
+    np.testing.assert_array_equal(run.sol(run.t), run.y)
+    y0 = given.pop("y0")
+    run = solve_ivp(field(acceleration), (0, END), y0, dense_output=True, **given)
+    error = max(largest(run.y - exact(run.t)), 1e-14)
+    assert largest(run.sol(TIMES) - exact(TIMES)) < 3 * error
+
+
+@both
+@steps
+def test_events_are_as_accurate_as_the_steps(method, options):
+    """Passages of the apsides are at multiples of pi, where the radius is 1 - e or 1 + e."""
+    given = {"method": method, "events": apsis, "compiled": False, **KEPLER, **options}
+    run = integrate(acceleration=pull, t_span=(0.1, END), save_every=1, **{**given, "y0": exact_kepler([0.1])[:, 0]})
+    error = max(largest(run.y - exact_kepler(run.t)), 1e-14)
+    turns = np.pi * np.arange(1, 16)
+    assert largest(run.t_events[0] - turns) < 3 * error
+    assert largest(np.array(run.y_events[0]).T - exact_kepler(turns)) < 10 * error
+
+
+@both
+def test_samples_have_the_order_of_the_steps(method):
+    """Halved steps divide the error of samples as they do that of the steps, of order p."""
+    errors = []
+    for h in (0.2, 0.1) if method is EIPRKN8 else (0.25, 0.125):
+        given = {"method": method, "h": h, "t_eval": np.linspace(0, 2, 101), "compiled": False, **KEPLER}
+        run = integrate(acceleration=pull, t_span=(0, 2), **given)
+        errors.append(largest(run.y - exact_kepler(run.t)))
+    assert np.log2(errors[0] / errors[1]) > method.TABLEAU.order - 2.0
+
+
+@both
+def test_backward_and_complex(method):
+    """Dense output works for the orbit run backward, and in the complex plane as one component."""
+    given = {"t_span": (0, -9), "method": method, "h": 0.05, "t_eval": -TIMES[:90], "compiled": False}
+    run = integrate(acceleration=pull, **given, **KEPLER)
+    assert largest(run.y - exact_kepler(run.t)) < (1e-9 if method is EIPRKN8 else 1e-13)
+    y0 = KEPLER["y0"][::2] + 1j * KEPLER["y0"][1::2]
+    plane = integrate(acceleration=lambda t, z: -z / abs(z) ** 3, y0=y0, **given)
+    real = integrate(acceleration=pull, y0=KEPLER["y0"], **given)
+    np.testing.assert_allclose([plane.y[0].real, plane.y[0].imag], real.y[:2], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("method", "further"), [(EIPRKN8, 5), (EIPRKN12, 15)])
+def test_evaluations_are_counted(method, further):
+    """Each step with samples in it takes the interpolant's further stages, and no other step does."""
+    given = {"method": method, "h": 0.1, "compiled": False, "y0": PROBLEM.y0}
+    plain = integrate(acceleration=pull, t_span=(0, 5), **given)
+    for count in (1, 20):
+        times = 0.1 * np.arange(10, 20)[:, None] + 0.1 * (np.arange(count) + 0.5) / count
+        assert (
+            integrate(acceleration=pull, t_span=(0, 5), t_eval=times.ravel(), **given).nfev == plain.nfev + 10 * further
+        )
+    assert integrate(acceleration=pull, t_span=(0, 5), dense_output=True, **given).nfev == plain.nfev + 50 * further
+    assert integrate(acceleration=pull, t_span=(0, 5), t_eval=plain.t, **given).nfev == plain.nfev
+
+
+def test_multistep_runs_too_short_for_a_history():
+    """Samples are those of the Nystrom method that starts the run, or, if accelerations depend on velocities, of the
+    quintic with the slopes at both ends of each step, for which DOP853 needs four steps.
+    """
+    times = np.linspace(0, 1, 41)
+    run = integrate(acceleration=pull, t_span=(0, 1), method=EIPGJ12, h=0.125, t_eval=times, compiled=False, **KEPLER)
+    assert largest(run.y - exact_kepler(times)) < 1e-9
+
+    def damped(t, y):
+        return np.concatenate([y[2:], pull(t, y[:2]) - 0.05 * y[2:]])
+
+    given = {"t_span": (0, 2), "y0": [0.8, 0.0, 0.0, 1.2], "t_eval": 2 * times}
+    exact = solve_ivp(damped, method="DOP853", rtol=1e-12, atol=1e-14, **given).y
+    run = integrate(damped, method=EIPGJ12, h=0.25, compiled=False, **given)
+    assert largest(run.y - exact) < 5e-6
+
+
+def test_methods_of_low_order_keep_the_quintic():
+    """Nystrom's own method of order 4: the quintic through both ends errs about as much as the steps, for nothing."""
+    weights = ["1/6", "1/3", 0], ["1/6", "2/3", "1/6"]
+    tableau = NystromTableau("Nystrom 4", [[], ["1/8"], [0, "1/2"]], *weights, [0, "1/2", 1], 4)
+    given = {"method": eip_method(tableau), "h": 0.02, "compiled": False, **KEPLER}
+    run = integrate(acceleration=pull, t_span=(0, 5), save_every=1, dense_output=True, **given)
+    times = np.linspace(0, 5, 333)
+    assert run.nfev == integrate(acceleration=pull, t_span=(0, 5), **given).nfev
+    assert largest(run.sol(times) - exact_kepler(times)) < 3 * largest(run.y - exact_kepler(run.t))

@@ -89,14 +89,6 @@ def test_order_and_invariant_of_a_method_in_place():
     assert observed_order(errors, [0.1, 0.05])[0] == pytest.approx(2, abs=0.1)
 
 
-def test_backward_and_a_shorter_last_step():
-    for h in (0.1, 0.03):
-        options = {"method": eip_method(RK4(oscillator)), "invariants": LENGTH, "iterations": 3}
-        sol = solve_ivp(oscillator, (0, -1), [1.0, 0.0], h=h, **options)
-        np.testing.assert_allclose(sol.y[:, -1], closed(-1), atol=1e-6)
-        assert abs(sol.y[:, -1] @ sol.y[:, -1] - 1) < 1e-15
-
-
 def test_dense_output_is_the_cubic_through_both_ends():
     """Between the steps its own error is h^4 / 384 = 2.6e-7; events and t_eval are read from it."""
     times = np.linspace(0, 10, 333)

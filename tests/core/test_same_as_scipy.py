@@ -1,14 +1,13 @@
-"""Without invariants the adaptive pairs take the steps of SciPy's classes; `integrate` takes those of the classes."""
+"""Without invariants the adaptive pairs take the steps of SciPy's classes."""
 
 import math
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.integrate import DOP853, RK23, RK45, solve_ivp
-from systems import JIT_H, JIT_L, JIT_NORM, jit_orbit, jit_spin, orbit, pericentre, spin, van_der_pol
+from systems import orbit, pericentre, spin, van_der_pol
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRK23, EIPRK45, EIPRKN12, Diagnostics, eip_method, integrate
+from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
 
 EPS = np.finfo(float).eps
 NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
@@ -134,29 +133,6 @@ def test_tight_tolerances(method):
         assert_close(ours.y[:, -1], theirs.y[:, -1], 10 * rtol)
 
 
-@pairs
-def test_buffer_that_fun_reuses(method):
-    """SciPy's classes give wrong results with it; ours must not."""
-    buffer = np.zeros(4)
-
-    def reusing(t, y):
-        buffer[:] = orbit(t, y)
-        return buffer
-
-    ours = solve_ivp(reusing, *KEPLER[1:], method=method)
-    assert_same(ours, solve_ivp(*KEPLER, method=METHODS[method]), LEVEL[method])
-
-
-def test_a_number_as_the_acceleration_of_one_component():
-    for method, options in ((EIPRK4, {"h": 0.1}), (EIPRKN12, {"h": 0.1, "variations": "state"})):
-        one, two = (
-            integrate(acceleration=a, t_span=(0, 1), y0=[1.0, 0.0], method=method, **options)
-            for a in (lambda t, q: -q[0], lambda t, q: -q)
-        )
-        np.testing.assert_array_equal(one.y, two.y)
-    np.testing.assert_array_equal(one.stm, two.stm)
-
-
 @pytest.mark.parametrize(
     ("fun", "options"),
     [
@@ -184,86 +160,3 @@ def test_failures(method):
     assert abs(len(ours.t) - len(theirs.t)) <= 0.05 * len(theirs.t)
     assert ours.t[-1] == pytest.approx(theirs.t[-1], abs=1e-12 + LEVEL[method])
     assert np.isfinite(ours.y).all()
-
-
-@pairs
-def test_first_steps_of_the_solver_object(method):
-    """max_step below the spacing of t: the first step is taken, the second fails, with SciPy's own words."""
-    ours, theirs = (m(orbit, 5.0, pericentre(0.6), 9.0, max_step=1e-20) for m in (method, METHODS[method]))
-    for _ in range(2):
-        assert ours.step() == theirs.step()
-        assert (ours.status, ours.t) == (theirs.status, theirs.t)
-    assert ours.status == "failed"
-    assert ours.t > 5.0
-
-
-@pairs
-def test_attributes_step_by_step(method):
-    ours, theirs = (m(orbit, 0.0, pericentre(0.6), 5.0) for m in (method, METHODS[method]))
-    rtol = LEVEL[method]
-    while theirs.status == "running":
-        assert ours.status == "running"
-        assert ours.step() == theirs.step()
-        for key in ("t", "t_old", "step_size"):
-            assert getattr(ours, key) == pytest.approx(getattr(theirs, key), rel=10 * rtol, abs=0)
-        for key in ("n", "nfev", "njev", "nlu", "direction", "t_bound", "status"):
-            assert getattr(ours, key) == getattr(theirs, key)
-        assert_close(ours.y, theirs.y, rtol)
-        mine, other = ours.dense_output(), theirs.dense_output()
-        assert (mine.t_old, mine.t) == (ours.t_old, ours.t)
-        t = 0.3 * theirs.t_old + 0.7 * theirs.t
-        assert_close(mine(t), other(t), rtol)
-    assert ours.status == "finished"
-
-
-# `integrate` and the classes: the same steps, bit for bit, from the same jitted functions.
-
-
-@njit
-def jit_event(t, y):
-    return y[0].real - 0.3
-
-
-RUNS = {
-    "plain": (jit_orbit, (0.0, 15.0), pericentre(0.6), ()),
-    "projected": (jit_orbit, (0.0, 15.0), pericentre(0.6), [JIT_H, JIT_L]),
-    "backward": (jit_orbit, (2.0, -10.0), pericentre(0.6), [JIT_H, JIT_L]),
-    "complex backward": (jit_spin, (3.0, -18.0), np.array([1.0 + 0j, 0.2j]), JIT_NORM),
-}
-COMPILED = pytest.param(True, marks=[pytest.mark.needs_jit, pytest.mark.slow])
-
-
-@pytest.mark.parametrize("compiled", [COMPILED, False], ids=["compiled", "interpreted"])
-@pytest.mark.parametrize("case", [pytest.param(name, marks=NIGHTLY if "complex" in name else []) for name in RUNS])
-def test_integrate_takes_the_steps_of_the_class(case, compiled):
-    fun, t_span, y0, invariants = RUNS[case]
-    for method in (*OWN, EIPRK4):
-        d = Diagnostics()
-        sol = solve_ivp(fun, t_span, y0, method=method, diagnostics=d, invariants=invariants)
-        run = integrate(fun, t_span, y0, method=method, save_every=1, compiled=compiled, invariants=invariants)
-        assert run.compiled is compiled
-        assert len(sol.t) > 10
-        assert (run.status, run.nfev, run.njev, run.nlu) == (sol.status, sol.nfev, sol.njev, sol.nlu)
-        np.testing.assert_array_equal(run.t, sol.t)
-        np.testing.assert_array_equal(run.y, sol.y)
-        np.testing.assert_array_equal(run.max_residual, d.max_residual)
-        assert repr(run.diagnostics) == repr(d)
-        assert run.h is None
-
-
-@pytest.mark.parametrize("compiled", [COMPILED, False], ids=["compiled", "interpreted"])
-@pytest.mark.parametrize("method", [eip_method(EIPRK45.TABLEAU), EIPRK4], ids=lambda m: m.__name__)
-def test_terminal_event_and_t_eval(method, compiled, monkeypatch):
-    """SciPy drops the samples after the event and does not add its state."""
-    monkeypatch.setattr(jit_event, "terminal", 3, raising=False)
-    options = {"method": method, "invariants": [JIT_H, JIT_L], "t_eval": np.linspace(0.0, 50.0, 301)}
-    options |= {"fun": jit_orbit, "t_span": (0.0, np.inf), "y0": pericentre(0.6), "events": jit_event}
-    sol, run = solve_ivp(**options), integrate(**options, compiled=compiled)
-    assert sol.status == 1
-    assert 10 < len(sol.t) < 301
-    np.testing.assert_array_equal(run.t, sol.t)
-    assert_close(run.y, sol.y, 8 * EPS)
-    # Roots are right to 4 eps (1 + |t|) in SciPy, and to 4 eps (h + |t|) in `integrate`. States move by this times a
-    # slope.
-    for kind in ("t_events", "y_events"):
-        assert_close(run[kind][0].T, sol[kind][0].T, 256 * EPS)

@@ -70,18 +70,3 @@ def test_what_is_no_such_array_is_refused(name):
         given[arrays[-1]] = given[arrays[-1]][:4].copy()
         with pytest.raises(ValueError, match="expected"):
             function(*given)
-
-
-@pytest.mark.parametrize("name", ["multiply", "weighted_square"])
-def test_factors_of_rows(name):
-    field = np.arange(24.0).view(complex).reshape(3, 4)
-    rows = np.array([[1.0], [2.0], [-3.0]])
-    each, by_row = (
-        (getattr(BUILD.condensates, name)(copy, factor), copy)
-        for factor in (np.repeat(rows, 4, axis=1), rows)
-        for copy in [field.copy()]
-    )
-    assert each[0] == by_row[0]
-    np.testing.assert_array_equal(each[1], by_row[1])
-    with pytest.raises(ValueError, match=f"{name}: expected a"):
-        getattr(BUILD.condensates, name)(field, np.ones((2, 1)))

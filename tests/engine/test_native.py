@@ -15,7 +15,6 @@ from systems import SPIN_NORM, SPIN_START, H, orbit, pericentre, spin
 from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12
 from eip_scipy.core.dense import Interpolants
 from eip_scipy.engine import native
-from eip_scipy.engine.data import new_work
 from eip_scipy.engine.native import BUILD, Engine
 from eip_scipy.run.prepare import RunArguments, prepared
 
@@ -100,79 +99,6 @@ def test_arrays_that_do_not_fit_are_refused(case):
                     engine.sample(changed) if part == "dense output" else Engine(**given | {part: changed})
                 refused += 1
     assert refused > (455 if len(records) > 3 else 240)
-
-
-WRONG_RECORDS = [
-    ("options", "blocks", lambda g: g._replace(member=g.member + np.uint64(9))),
-    ("options", "blocks", lambda g: g._replace(start=g.start[::-1].copy())),
-    ("options", "blocks", lambda g: g._replace(width=3)),
-    ("options", "frame", lambda f: f._replace(place=f.place + np.uint64(4))),
-    ("options", "frame", lambda f: f._replace(start=f.start + np.uint64(1))),
-    ("options", "every", lambda every: -1),
-    ("options", "every", lambda every: 2**70),
-    ("options", "kappa", lambda kappa: "much"),
-    ("method", "A", lambda A: A[:, :1].copy()),
-    ("method", "e", lambda e: np.zeros(9)),
-    ("functions", "inv", lambda inv: ()),
-    ("functions", "grad", lambda grad: 3),
-    ("functions", "rhs", lambda rhs: rhs._replace(args=[1])),
-    ("functions", "rhs", lambda rhs: rhs._replace(shape=(5,))),
-    ("functions", "rhs", lambda rhs: rhs._replace(shape=4)),
-    ("functions", "rhs", lambda rhs: rhs._replace(args=tuple(range(99)))),
-]
-
-
-def test_records_that_do_not_fit_are_refused():
-    given = parts(**CASES["kepler"])
-    for part, name, value in WRONG_RECORDS:
-        changed = given[part]._replace(**{name: value(getattr(given[part], name))})
-        with pytest.raises((TypeError, ValueError, OverflowError)):
-            Engine(**given | {part: changed})
-
-
-def test_buffers_that_do_not_fit_are_refused():
-    given = parts(**CASES["kepler"])
-    fitting = 4, float, 4, 1, 2
-    for place, value in enumerate((5, complex, 3, 2, 9)):
-        sizes = [*fitting[:place], value, *fitting[place + 1 :]]
-        with pytest.raises((TypeError, ValueError), match="engine: "):
-            Engine(**given | {"work": new_work(*sizes)})
-    with pytest.raises(TypeError, match="engine: work"):
-        Engine(**given | {"work": ()})
-    for sizes in ((-1, float, 4, 1, 2), (4, float, -1, 1, 2), (4, np.float32, 4, 1, 2), (4, "nothing", 4, 1, 2)):
-        with pytest.raises((TypeError, ValueError)):
-            new_work(*sizes)
-
-
-def test_calls_with_wrong_arguments():
-    given = parts(h=0.1, invariants=H)
-    engine, y, two = Engine(**given), np.zeros(4), np.zeros(2)
-    calls = [
-        ("step", 0, 0.0, y),
-        ("step", 0, 0.0, y, y[:3]),
-        ("step", 0, 0.0, y.astype(complex), y),
-        ("step", "a", 0.0, y, y),
-        ("step", 0, "a", y, y),
-        ("advance", 1, y, y, two),
-        ("advance", 1, y, y, two, np.zeros((3, 4)), None),
-        ("advance", 1, y, y, two, np.zeros((2, 4), order="F"), None),
-        ("advance", 2**80, y, y, two, np.zeros((2, 4)), None),
-        ("sample", given["work"]),
-        ("describe", 0.0, y, 1.0, y, np.zeros(31)),
-        ("interpolate", np.zeros(31), two, np.zeros((2, 4))),
-        ("values", two, np.zeros((2, 4)), np.zeros((1, 1))),
-        ("project", 0.0, y, 1.0, True, [0.0] * 4),
-        ("close", 0.0, y, True, "no code"),
-        ("start", y, y, None),
-    ]
-    for name, *arguments in calls:
-        with pytest.raises((TypeError, ValueError, OverflowError, AttributeError, RuntimeError)):
-            getattr(engine, name)(*arguments)
-    given["schedule"].place[1] = 9
-    with pytest.raises(ValueError, match="rows"):
-        engine.advance(1, y, y, two, np.zeros((2, 4)), None)
-    with pytest.raises(RuntimeError, match="schedule"):
-        Engine(**given | {"schedule": None}).step(0, 0.0, y, y)
 
 
 def test_a_run_is_not_stepped_from_its_own_functions():

@@ -1,8 +1,5 @@
 """Quantities and times of astropy: converted to plain numbers in a problem's units, and back."""
 
-import importlib
-import sys
-
 import numpy as np
 import pytest
 from systems import refuse
@@ -169,10 +166,3 @@ def test_initial_data_of_a_date():
     np.testing.assert_allclose(data.position, expected.position, rtol=0, atol=1e-14)
     with pytest.raises(TypeError, match=r"^epoch_jd_tdb: .* is a date"):
         jpl.initial_data(EPOCH)
-
-
-def test_a_missing_package_says_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "astropy", None)
-    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.astropy")
-    with pytest.raises(ImportError, match=r'pip install "eip_scipy\[astro\]"'):
-        importlib.import_module("eip_scipy.integrations.astropy")

@@ -120,13 +120,6 @@ def test_the_motion_is_that_of_rebound(kind):
     np.testing.assert_allclose(run.y[:, -1], state(sim), rtol=0, atol=1e-11)
 
 
-def test_names_may_be_given():
-    problem = exchange.problem_from_simulation(planets(), names=["A", "B", "C", "D"])
-    assert problem.component_names[::3] == ("x_A", "x_B", "x_C", "x_D", "vx_A", "vx_B", "vx_C", "vx_D")
-    with pytest.raises(ValueError, match="expected 4 names, all different"):
-        exchange.problem_from_simulation(planets(), names=["A", "A", "C", "D"])
-
-
 def test_orbits_as_balances_against_ias15():
     """The orbits keep their energies at known rates, and the bodies come nearer to the positions of IAS15."""
     sim = planets(test_mass=0.0)
@@ -228,6 +221,8 @@ def test_bad_input_is_named():
         return exchange.to_simulation(run, y, **options)
 
     refuse(call, rows)
+    with pytest.raises(ValueError, match="expected 4 names, all different"):
+        exchange.problem_from_simulation(planets(), names=["A", "A", "C", "D"])
     with pytest.raises(TypeError, match="expected a run by integrate"):
         exchange.to_archive(solar_system(), "x.bin")
     with pytest.raises(ValueError, match="every must be an integer >= 1"):

@@ -2,7 +2,6 @@
 
 import math
 from fractions import Fraction
-from math import comb
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ import pytest
 from eip_scipy import EIPGJ12, eip_method, integrate
 from eip_scipy.methods import GaussJackson
 from eip_scipy.methods.gauss_jackson import (
-    correction_weights,
-    interpolation_weights,
     longest_stable,
     position_series,
     position_weights,
@@ -66,14 +63,6 @@ def test_exact_for_polynomials_up_to_the_order(order):
     assert missed_by_velocity(0, order, order + 1) != 0
 
 
-@pytest.mark.parametrize("order", [8, 12, 14])
-def test_correction_is_a_difference(order):
-    """Corrector minus predictor is a multiple of the difference of the accelerations of that order."""
-    found = correction_weights(order)
-    assert found[0] != 0
-    assert found == [found[0] * (-1) ** j * comb(order, j) for j in range(order + 1)]
-
-
 @pytest.mark.parametrize("order", ORDERS)
 def test_rounded_weights_keep_their_moments(order):
     """Coefficients are rounded such that together they miss their moments by far less than the nearest floats."""
@@ -89,50 +78,10 @@ def test_rounded_weights_keep_their_moments(order):
     assert missed(rounded) <= min(missed(nearest), 5e-15)
 
 
-@pytest.mark.parametrize("order", [4, 7, 14])
-def test_interpolation(order):
-    """Each polynomial is 1 at its node and 0 at the others."""
-    for back in range(order):
-        nodes = [back - j for j in range(order)]
-        table = interpolation_weights(order)[back]
-        values = [[sum(Fraction(c) * Fraction(x) ** p for p, c in enumerate(row)) for x in nodes] for row in table]
-        assert np.allclose(np.array(values, float), np.eye(order), atol=1e-5)
-
-
-def amplitude(order, corrected, x, steps=3000):
-    """Return the amplitude of the recursion for q'' = -q after `steps` steps of length x, from an exact start."""
-    z = x * x
-    P, D = (np.array([float(w) for w in f(order)]) for f in (lambda k: position_weights(-1, k), correction_weights))
-    a = list(-np.cos(x * np.arange(-2, order)))
-    q = [np.cos(x * (order - 2)), np.cos(x * (order - 1))]
-    for _ in range(steps):
-        recent = np.array(a[: -order - 3 : -1])
-        second = recent[:-2] - 2 * recent[1:-1] + recent[2:]
-        # q = h^2 (S + sum P a), whose second difference has no sum left.
-        q = [q[1], 2 * q[1] - q[0] + z * (recent[0] + P @ second)]
-        value = -q[1]
-        if corrected:
-            value -= z * (D[0] * value + D[1:] @ recent[:order])
-        a.append(value)
-        if abs(value) > 1e6:
-            return np.inf
-    return max(abs(v) for v in a[-100:])
-
-
-@pytest.mark.parametrize("corrected", [False, True])
-def test_stability_limit(corrected):
-    """The recursion in plain floats is bounded below the limit, and grows above it."""
-    for order in (4, 6, 8, 10, 12, 14):
-        limit = stability_limit(order, corrected)
-        assert amplitude(order, corrected, 0.97 * limit) < 2
-        assert amplitude(order, corrected, 1.3 * limit) > (1e3 if order >= 10 else 1.05)
-        assert stability_limit(order, True) > 3 * stability_limit(order, False) or order < 8
-
-
 def test_stability_with_weak_damping():
     """A step within the limits for both alone may be unstable, as the error of a damped oscillator shows."""
     fast, damped = 0.05, 5e-4
-    assert fast < stability_limit(12, False)
+    assert fast < stability_limit(12, False) < stability_limit(12, True) / 3
     assert longest_stable(12, False, 0.0, damped) == 1.0
     part = longest_stable(12, False, fast, damped)
     assert 0.5 < part < 1.0

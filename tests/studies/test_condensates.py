@@ -9,10 +9,9 @@ from eip_scipy.problems import Grid, GrossPitaevskii
 
 pytest.importorskip("numba")
 from eip_scipy_studies.condensates.ground_state import ground_state, imprint, polygon, ring_start, thomas_fermi
-from eip_scipy_studies.condensates.pointwise import inner, local_flow
 from eip_scipy_studies.condensates.problems import harmonic_trap, plane_wave, quartic_trap, soliton
-from eip_scipy_studies.condensates.splitting import LinearFlow, Splitting, rotated
-from eip_scipy_studies.condensates.vortices import density_surface, vortices
+from eip_scipy_studies.condensates.splitting import Splitting
+from eip_scipy_studies.condensates.vortices import vortices
 
 pytestmark = pytest.mark.needs_jit
 
@@ -52,53 +51,6 @@ def test_vortices_are_found_where_they_are():
         assert all(np.hypot(*(found.positions - place).T).min() < 0.02 for place in places)
     gpe = GrossPitaevskii(Grid((210, 210), -10, 10), quartic_trap(1.2, 0.3, 1, 1), Omega=3.5, beta=1000)
     assert len(vortices(gpe, ring_start(gpe, 38, 123)).charges) == 38
-
-
-def test_surfaces_are_an_ellipsoid_and_tubes_around_vortices():
-    pytest.importorskip("skimage")
-    gpe = GrossPitaevskii(Grid((48, 48, 32), (-6, -6, -9), (6, 6, 9)), harmonic_trap(1, 1, 0.5), Omega=0.5, beta=200)
-    x, y, z = gpe.grid.mesh()
-    corners, inside = density_surface(gpe, np.exp(-(x**2 + y**2 + z**2 / 4) / 4), np.exp(-2.0))
-    a, b, c = corners.reshape(-1, 3).T
-    np.testing.assert_allclose(np.sqrt(a**2 + b**2 + c**2 / 4), 2.0, atol=0.01)
-    assert not inside.any()
-    places = np.array([[1.0, 0.3], [-1.1, 0.0]])
-    psi = imprint(gpe, places)
-    corners, inside = density_surface(gpe, psi, 0.1 * np.abs(psi).max() ** 2)
-    middle = corners.mean(axis=1)
-    tubes = middle[inside & (np.abs(middle[:, 2]) < 2)]
-    away = np.hypot(*(tubes[:, None, :2] - places).transpose(2, 0, 1))
-    assert away.min(axis=1).max() < 0.5
-    assert set(away.argmin(axis=1)) == {0, 1}
-
-
-def packet(x, y, t):
-    """Return a Gaussian away from the centre in free motion."""
-    spread = 1 + 1j * t
-    return np.exp(-((x - 2) ** 2 + (y - 1) ** 2) / (2 * spread)) / spread
-
-
-def turned(x, y, angle):
-    return np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y
-
-
-@pytest.mark.parametrize("Omega", [0.0, 0.8])
-def test_flows_are_free_motion_in_a_rotating_frame_a_rotation_and_a_phase(Omega):
-    grid = Grid((96, 112), (-11, -12), (11, 13))
-    gpe = GrossPitaevskii(grid, Omega=Omega)
-    start, work = packet(*grid.mesh(), 0.0), np.empty(grid.shape, complex)
-    moved = LinearFlow(gpe, 0.7).apply(start.copy(), work)[0]
-    np.testing.assert_allclose(moved, packet(*turned(*grid.mesh(), Omega * 0.7), 0.7), rtol=0, atol=1e-11)
-    for angle in (2.0, -3.0):
-        exact = packet(*turned(*grid.mesh(), angle), 0)
-        np.testing.assert_allclose(rotated(gpe, start, angle), exact, rtol=0, atol=1e-10)
-    psi = np.random.default_rng(3).standard_normal(2 * grid.size).view(complex).reshape(grid.shape)
-    V = 50 * np.sin(sum(grid.mesh()))
-    for h, tolerance in ((-0.1, 1e-13), (2e3, 2e-10)):  # angles of up to 1e5, whose own rounding is 1e-11
-        out = psi.copy()
-        local_flow(out, V, 0.7, h)
-        np.testing.assert_allclose(out, psi * np.exp(-1j * h * (V + 0.7 * abs(psi) ** 2)), atol=tolerance)
-    assert inner(psi, out) == pytest.approx(np.vdot(psi, out).real, abs=1e-9)
 
 
 @pytest.mark.parametrize(("scheme", "steps"), [("strang", (0.025, 0.0125)), ("rkn6", (0.05, 0.025))])

@@ -1,4 +1,4 @@
-"""The paper's tables 1-4 in 50 digits, independent of the package: ``python tests/mpmath_tables.py`` stores them.
+"""The paper's tables 1-4 in 50 digits, independent of the package: ``python tools/paper_tables.py`` stores them.
 
 The results go as the lists "mpmath" into paper_tables.json of eip_scipy_studies/data, where they say what the paper and
 we would both have without round-off. Steps, tableaux and start are the decimals of the paper, not their doubles.
@@ -26,55 +26,70 @@ TABLEAUX = {
 
 
 def exact(text):
+    """Return a decimal or fraction in all digits."""
     fraction = Fraction(text)
     return mpf(fraction.numerator) / fraction.denominator
 
 
 def inner(a, b):
+    """Return the inner product."""
     return mpmath.fsum(x * y for x, y in zip(a, b, strict=True))
 
 
 class Harmonic:
+    """The oscillator of tables 1 and 2."""
+
     omega = mpf(10)
     start = (mpf(1), mpf(0))
 
     def f(self, y):
+        """Return the right-hand side."""
         return (self.omega * y[1], -self.omega * y[0])
 
-    def H(self, y):
+    def H(self, y):  # noqa: N802
+        """Return the energy."""
         return self.omega * inner(y, y) / 2
 
-    def grad_H(self, y):
+    def grad_H(self, y):  # noqa: N802
+        """Return the gradient of the energy."""
         return (self.omega * y[0], self.omega * y[1])
 
 
 class Kepler:
+    """The perturbed Kepler problem of tables 3 and 4, with an eccentricity of 0.6."""
+
     start = (mpf(2) / 5, mpf(0), mpf(0), mpf(2))  # e = 0.6
     relativistic = mpf(1) / 200
 
     def f(self, y):
+        """Return the right-hand side."""
         q1, q2, p1, p2 = y
         r = mpmath.sqrt(q1**2 + q2**2)
         w = 1 / r**3 + 3 * self.relativistic / (2 * r**5)
         return (p1, p2, -w * q1, -w * q2)
 
-    def H(self, y):
+    def H(self, y):  # noqa: N802
+        """Return the energy."""
         q1, q2, p1, p2 = y
         r = mpmath.sqrt(q1**2 + q2**2)
         return (p1**2 + p2**2) / 2 - 1 / r - self.relativistic / (2 * r**3)
 
-    def grad_H(self, y):
+    def grad_H(self, y):  # noqa: N802
+        """Return the gradient of the energy."""
         v1, v2, a1, a2 = self.f(y)
         return (-a1, -a2, v1, v2)
 
-    def L(self, y):
+    def L(self, y):  # noqa: N802
+        """Return the angular momentum."""
         return y[0] * y[3] - y[1] * y[2]
 
-    def grad_L(self, y):
+    def grad_L(self, y):  # noqa: N802
+        """Return the gradient of the angular momentum."""
         return (y[3], -y[2], -y[1], y[0])
 
 
 def rk_step(f, method, y, h):
+    """Return the raw result of a step."""
     rows, weights = TABLEAUX[method]
     slopes = []
     for row in rows:
@@ -132,6 +147,7 @@ def residual(series, h):
 
 
 def end_state(series, h):
+    """Return the state at t = 1."""
     return last_step(Kepler(), series, h, list(series["invariants"]))[0]
 
 
@@ -154,6 +170,7 @@ def write(data):
 
 
 def main():
+    """Compute and store all series but those of table 5."""
     data = json.loads(DATA.read_text(encoding="utf-8"))
     for series in data["series"]:
         if series["table"] == 5:  # a field of 16384 points
