@@ -123,9 +123,6 @@ def twice(t, y):
     return 2 * y
 
 
-JIT_NORM = Invariant(jit_norm, twice, name="N")
-
-
 # Three complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
 
 

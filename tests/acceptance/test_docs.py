@@ -1,11 +1,17 @@
 """The Python code of the documentation runs as printed, and prints the output below it."""
 
 import math
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from c_compiler import compiler
 
 pytestmark = pytest.mark.needs_jit
 
@@ -28,12 +34,6 @@ def assert_output(found, printed):
         assert agree(float(a), float(b)), f"{a}, printed as {b}"
 
 
-PAGES = (
-    "tutorials/first-problem", "tutorials/invariants", "tutorials/compiled-functions", "tutorials/orbits",
-    "tutorials/pdes", "tutorials/ensembles", "how-to/tables-figures-files", "how-to/checkpoints",
-    "how-to/own-methods", "how-to/mechanisms", "how-to/fitting", "how-to/positivity",
-    "explanation/trust",
-)  # fmt: skip
 # Packages of single sections, which are left out if theirs is missing.
 OF_SECTIONS = {
     "docs/how-to/mechanisms.md": ("pydy",),
@@ -48,14 +48,16 @@ NIGHTLY = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        "README.md",
-        *(pytest.param(f"docs/{page}.md", marks=pytest.mark.slow) for page in PAGES),
-        *(pytest.param(f"docs/{page}.md", marks=[pytest.mark.nightly, pytest.mark.slow]) for page in NIGHTLY),
-    ],
-)
+PAGES = [path for path in sorted((ROOT / "docs").glob("[a-z]*/*.md")) if "\n```python\n" in path.read_text("utf-8")]
+
+
+def with_marks(path):
+    page = path.relative_to(ROOT).as_posix()
+    nightly = [pytest.mark.nightly] * any(name in page for name in NIGHTLY)
+    return pytest.param(page, marks=[pytest.mark.slow, *nightly])
+
+
+@pytest.mark.parametrize("page", ["README.md", *map(with_marks, PAGES)])
 def test_page(page, capsys, tmp_path, monkeypatch):
     """Run all blocks of a page in turn, in one namespace; a block of text is the output of the code before it."""
     monkeypatch.chdir(tmp_path)  # where pages write their files
@@ -122,3 +124,31 @@ def test_notebooks_are_listed():
         title = re.search(r"^# (.+)$", text, re.MULTILINE)[1]
         assert f"| [{title}](notebooks/{notebook.stem}) |" in page
         assert f"\nnotebooks/{notebook.stem}\n" in page
+
+
+# The examples in C and Cython are built and run as described, and print the printed output.
+C_PAGE = (ROOT / "docs/tutorials/compiled-functions.md").read_text(encoding="utf-8").partition("## Functions in C")[2]
+BUILD = re.compile(r"^```console\n\$ (.*)\n```$", re.MULTILINE)
+PRINTED = re.compile(r"^```console\n\$ python \S+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    ("k", "script"),
+    [(0, "with_ctypes.py"), pytest.param(1, "with_cython.py", marks=[pytest.mark.nightly, pytest.mark.slow])],
+)
+def test_example_in_c(k, script, tmp_path):
+    shutil.copytree(ROOT / "examples" / "c-functions", tmp_path, dirs_exist_ok=True)
+    first, *rest = shlex.split(BUILD.findall(C_PAGE)[k])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)]), "CC": shlex.join(compiler())}
+    command = {"cc": compiler(), "cythonize": [sys.executable, "-m", "Cython.Build.Cythonize"]}[first]
+    subprocess.run([*command, *rest], cwd=tmp_path, env=environment, check=True, capture_output=True)
+    ran = [sys.executable, "-W", "error", script]
+    found = subprocess.run(ran, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert found.stderr == ""
+    assert_output(found.stdout, PRINTED.findall(C_PAGE)[k])
+
+
+def test_the_page_on_c_shows_all_files():
+    shown = re.findall(r"^```\{literalinclude\} \.\./\.\./(\S+)$", C_PAGE, re.MULTILINE)
+    assert sorted(shown) == sorted(str(path.relative_to(ROOT)) for path in (ROOT / "examples/c-functions").iterdir())
+    assert all(f"`{Path(path).name}`" in C_PAGE for path in shown)

@@ -82,15 +82,10 @@ def test_some_of_the_runs(run):
 
 
 def test_the_command_counts(tmp_path, capsys):
-    """A run that is called faulty and is correct is silent."""
     assert main(["trust", "--only", "fall with drag 0.1", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "faulty runs are reported: 3 of 3" in out
     assert re.search(r"\| no invariant, its rate 0 at the start +\| 2 ", (tmp_path / "trust.md").read_text())
-    right = next(run for run in RUNS if run.group == "further systems")
-    found = command.record(replace(right, faulty=True))
-    assert found["first"] == command.SILENT
-    assert found["error"] < 0.1
 
 
 @pytest.mark.nightly
@@ -211,7 +206,7 @@ def test_friction_where_the_gradient_is_computed(driver):
         driver(problem, method=EIPRK45, rtol=1e-6, atol=1e-8)
 
 
-# --- leaks and kinks that the study does not have ---
+# --- leaks that the study does not have ---
 
 LATER = "'energy' is not an invariant of this system: at t=-?[0-9]"
 
@@ -412,8 +407,6 @@ def test_a_bound_on_the_number_of_steps(tmp_path):
     resumed = integrate(fun, (0, 20), y0, max_steps=1000, resume=True, **options)
     np.testing.assert_array_equal(resumed.y[:, -1], whole.y[:, -1])
     assert integrate(fun, (0, 1.1), y0, method=EIPRK4, h=0.1, max_steps=11).status == 0
-    with pytest.raises(ValueError, match="max_steps must be an integer >= 1"):
-        integrate(fun, (0, 20), y0, method=EIPDOP853, max_steps=0)
 
 
 def test_a_late_and_tiny_loss_is_seen_also_by_a_compiled_gradient():

@@ -30,7 +30,6 @@ from eip_scipy import (
     EIPRK5,
     EIPRK23,
     EIPRK45,
-    EIPRKN12,
     Diagnostics,
     Invariant,
     integrate,
@@ -97,13 +96,6 @@ def test_error_goes_with_the_tolerance(method):
     assert kept == pytest.approx(free, rel=0.2)
 
 
-def test_max_step_and_first_step_are_obeyed():
-    steps = np.diff(run(t_span=(0, 10), invariants=H, max_step=0.07, first_step=0.05).t)
-    assert steps[0] == pytest.approx(0.05)
-    assert 0.069 < steps.max() <= 0.07 + 1e-15
-    assert run(t_span=(0, 10), invariants=H, first_step=5.0).t[1] < 1.0
-
-
 # The option, whether it changes the states, and the energy that is kept.
 OPTIONS = {
     "no invariants": ({"invariants": ()}, True, None),
@@ -160,22 +152,6 @@ def test_options_of_both_drivers(option):
             assert energy(0, found.y[:, 0]) == pytest.approx(kept, abs=1e-14)
         bare = run(method=method, rtol=1e-4, atol=1e-6, invariants=H)
         assert np.array_equal(bare.y[:, -1], found.y[:, -1]) != has_effect
-
-
-@pytest.mark.parametrize("driver", [run, solve_ivp])
-@pytest.mark.parametrize(
-    ("method", "step"), [(EIPRK45, {"rtol": 1e-6, "atol": 1e-9}), (EIPRK4, {"h": 0.02}), (EIPRKN12, {"h": 0.2})]
-)
-def test_every_hands_out_copies_on_the_manifold(driver, method, step):
-    """Rows, samples, events and dense output between two projections satisfy the invariants."""
-    every = {"t_span": (0, 6), "y0": Y0, "method": method, "invariants": [H, L], "every": 4, **step}
-    rows = driver(orbit, **every)
-    more = {"t_eval": np.linspace(0, 6, 43), "events": lambda t, y: y[0], "dense_output": True}
-    sampled = driver(orbit, **more, **every)
-    assert sampled.y_events[0].size
-    for states in (rows.y, sampled.y, sampled.sol(np.linspace(0, 6, 101)), sampled.y_events[0].T):
-        np.testing.assert_allclose([energy(0, y) for y in states.T], energy(0, Y0), rtol=0, atol=1e-11)
-    np.testing.assert_array_equal(sampled.sol(rows.t[1:]), rows.y[:, 1:])
 
 
 @pytest.mark.parametrize("driver", [run, solve_ivp])

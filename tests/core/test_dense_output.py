@@ -1,4 +1,4 @@
-"""Dense output: exactly y_k at t_k, on the manifold in between, of SciPy's orders, and safe brackets for events."""
+"""Dense output: exactly y_k at t_k, on the manifold in between, safe brackets for events, and pickles."""
 
 import copy
 import functools

@@ -17,14 +17,19 @@ njit = numba.njit
 pytestmark = pytest.mark.needs_jit
 
 Y = np.array([0.7, -0.4, 1.3, 0.2])
-FUNCTIONS = {}
+FUNCTIONS, NAMES = {}, []
+NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
 
 
-def case(exact, shape=()):
-    """Return a jitted function and its mpmath counterpart, of four numbers, or for a tuple of them."""
+def case(exact, shape=(), gate=False):
+    """Return a jitted function and its mpmath counterpart, of four numbers, or for a tuple of them.
+
+    Each takes some seconds to compile: in the gate there is one of each kind.
+    """
 
     def add(fun):
         FUNCTIONS[fun.__name__] = njit(fun), exact, shape
+        NAMES.append(fun.__name__ if gate else pytest.param(fun.__name__, marks=NIGHTLY))
 
     return add
 
@@ -34,12 +39,15 @@ def powers(t, y):
     return y[0] ** 1.5 + y[2] ** -3 + math.pow(y[1], 3.0) + 2.0 ** y[0] + y[0] ** y[2]
 
 
-@case(lambda a, b, c, d: (c**2 + d**2) / 2 - 1 / mpmath.sqrt(a**2 + b**2))
+@case(lambda a, b, c, d: (c**2 + d**2) / 2 - 1 / mpmath.sqrt(a**2 + b**2), gate=True)
 def kepler_by_arrays(t, y):
     return 0.5 * np.sum(y[2:] ** 2) - 1.0 / np.sqrt(y[:2] @ y[:2])
 
 
-@case(lambda a, b, c, d: mpmath.exp(-a * b) + mpmath.expm1(c) * mpmath.tanh(d) + mpmath.log(c) + mpmath.log1p(a))
+@case(
+    lambda a, b, c, d: mpmath.exp(-a * b) + mpmath.expm1(c) * mpmath.tanh(d) + mpmath.log(c) + mpmath.log1p(a),
+    gate=True,
+)
 def exponentials(t, y):
     return math.exp(-y[0] * y[1]) + np.expm1(y[2]) * math.tanh(y[3]) + math.log(y[2]) + np.log1p(y[0])
 
@@ -49,12 +57,14 @@ def trigonometric(t, y):
     return np.cos(y[0]) * math.tan(y[3]) + math.asin(y[1]) + np.arccos(y[0]) + math.atan2(y[3], y[1])
 
 
-@case(lambda a, b, c, d: mpmath.sinh(a) / mpmath.cosh(b) + mpmath.asinh(c) + mpmath.acosh(c) + mpmath.atanh(d))
+@case(
+    lambda a, b, c, d: mpmath.sinh(a) / mpmath.cosh(b) + mpmath.asinh(c) + mpmath.acosh(c) + mpmath.atanh(d), gate=True
+)
 def hyperbolic(t, y):
     return math.sinh(y[0]) / np.cosh(y[1]) + math.asinh(y[2]) + math.acosh(y[2]) + math.atanh(y[3])
 
 
-@case(lambda a, b, c, d: 1 + d**2)
+@case(lambda a, b, c, d: 1 + d**2, gate=True)
 def branch_of_another_type(t, y):
     total = y[0] if y[0] < 0.0 else 1.0
     return total + y[3] ** 2
@@ -81,7 +91,7 @@ def products(y, scale=2.0):
     return out
 
 
-@case(lambda a, b, c, d: (2 * a * b, 2 * b * c, 2 * c * d), shape=(3,))
+@case(lambda a, b, c, d: (2 * a * b, 2 * b * c, 2 * c * d), shape=(3,), gate=True)
 def array_filled_in_another_function(t, y):
     return products(y)
 
@@ -90,8 +100,7 @@ def computed(fun, y, extra=()):
     return InvariantSet(Invariant(fun), 0.0, y, np.ones_like(y), 1.0, extra).gradients(0.0, y, y)
 
 
-# Each takes some seconds to compile: in the gate one of each kind.
-@case(lambda a, b, c, d: (a / c - b / c + c * a + c - b * d / 2) ** 2)
+@case(lambda a, b, c, d: (a / c - b / c + c * a + c - b * d / 2) ** 2, gate=True)
 def arrays_and_a_number_that_varies(t, y):
     q = y[:2]
     one, two, three = -q / y[2], y[2] * q, y[2] - q * y[3] / 2.0
@@ -100,24 +109,11 @@ def arrays_and_a_number_that_varies(t, y):
 
 @case(
     lambda a, b, c, d: (a - 0.6) ** 2 * b + (c - 4) ** 3 + b * mpmath.mpf(1.3)
-    + (a - 0.5) ** 2 + (b + 0.5) ** 2 + (c - 1.5) ** 2 + d**2
+    + (a - 0.5) ** 2 + (b + 0.5) ** 2 + (c - 1.5) ** 2 + d**2, gate=True
 )  # fmt: skip
 def nearest_images(t, y):
     one = (y[0] - 0.3 * round(y[0] / 0.3)) ** 2 * y[1] + (y[2] - np.rint(3 * y[2])) ** 3 + np.around(y[2], 1) * y[1]
     return one + y[3] * (int(4 * y[0]) + np.trunc(7 * y[1])) + np.sum((y - 0.5 * np.round(y / 0.5)) ** 2)
-
-
-GATE = {
-    "nearest_images",
-    "arrays_and_a_number_that_varies",
-    "kepler_by_arrays",
-    "exponentials",
-    "hyperbolic",
-    "branch_of_another_type",
-    "array_filled_in_another_function",
-}
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
-NAMES = [name if name in GATE else pytest.param(name, marks=NIGHTLY) for name in FUNCTIONS]
 
 
 @pytest.mark.parametrize("name", NAMES)

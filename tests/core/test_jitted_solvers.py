@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from systems import jit_norm, jit_spin, twice
 
-from eip_scipy import EIPDOP853, EIPRK4, Invariant
+from eip_scipy import EIPRK4, Invariant
 
 numba = pytest.importorskip("numba")
 njit = numba.njit
 pytestmark = pytest.mark.needs_jit
 
 Y0 = np.array([0.4, 0.0, 0.0, 2.0])
-MATRIX = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
 @njit
@@ -36,21 +34,6 @@ def both_gradients(t, y):
 
 def in_python(fun):
     return lambda t, y: fun(t, y)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fun", "y0", "invariant"),
-    [(rhs, Y0, (both, both_gradients)), (jit_spin, np.array([0.6, 0.8j]), (jit_norm, twice))],
-)
-def test_states_are_those_of_python_calls(fun, y0, invariant):
-    for options in ({"method": EIPRK4, "h": 0.03}, {"method": EIPDOP853, "rtol": 1e-6}):
-        jitted, python = (
-            solve_ivp(wrap(fun), (0, 3), y0, invariants=[Invariant(*map(wrap, invariant))], **options)
-            for wrap in (lambda f: f, in_python)
-        )
-        assert (jitted.y == python.y).all()
-        assert (jitted.nfev, jitted.njev, jitted.nlu) == (python.nfev, python.njev, python.nlu)
 
 
 def test_python_is_not_called_in_the_steps(monkeypatch):

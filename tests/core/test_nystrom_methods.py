@@ -1,4 +1,4 @@
-"""Runge-Kutta-Nystrom methods: orders of steps and samples, events, compensated sums, and refused arguments."""
+"""Runge-Kutta-Nystrom methods: orders of steps and of what is between them."""
 
 import numba
 import numpy as np
@@ -47,23 +47,6 @@ def test_time_reaches_every_stage(method):
         given = {"t_span": (0.4, 2.4), "y0": start, "method": method, "h": 0.05, "compensated": compensated}
         run = integrate(acceleration=lambda t, q: np.array([-9 * np.sin(3 * t)]), **given)
         np.testing.assert_allclose(run.y[:, -1], end, rtol=0, atol=1e-10)
-
-
-@both
-def test_what_is_no_second_order_system(method):
-    """The order of the state is wrong, an acceleration depends on the velocity, or the number of components is odd."""
-    with pytest.raises(ValueError, match="the first 2 components of fun must be v"):
-        solve_ivp(lambda t, y: np.concatenate([acceleration(t, y[2:]), y[:2]]), (0, 1), Y0, method=method, h=0.1)
-    with pytest.raises(ValueError, match="accelerations in fun depend on the velocity; use a Runge-Kutta"):
-        solve_ivp(lambda t, y: [y[2], y[3], -y[2], -y[3]], (0, 1), Y0, method=method, h=0.1)
-    for call in (
-        lambda: solve_ivp(lambda t, y: -y, (0, 1), Y0[:3], method=method, h=0.1),
-        lambda: integrate(acceleration=acceleration, t_span=(0, 1), y0=Y0[:3], method=method, h=0.1),
-    ):
-        with pytest.raises(ValueError, match="even number of components, but y0 has 3"):
-            call()
-    with pytest.raises(ValueError, match=r"acceleration returned shape \(4,\), expected \(2,\)"):
-        integrate(acceleration=lambda t, q: np.zeros(4), t_span=(0, 1), y0=Y0, method=method, h=0.1)
 
 
 def test_auto_projects_where_it_pays():

@@ -1,4 +1,4 @@
-"""Properties of the projection on random data: invariances, least norms, and the metric against its formula."""
+"""Properties of the projection on random data: invariances, least norms, and what the error metric measures."""
 
 import mpmath
 import numpy as np
@@ -239,7 +239,7 @@ def test_complex_frame(seed, n):
     assert abs(C @ project(q.y_hat, kept, iterations=5).correction) > 1e-9
 
 
-# The step: units, rotations, frames.
+# The step: units.
 
 
 def kepler_in_units(unit, metric="error", atol=0.0, blocks=None, steps=40, eccentricity=0.6, time=1.0):

@@ -9,8 +9,6 @@ from systems import orbit, pericentre, spin, van_der_pol
 
 from eip_scipy import EIPDOP853, EIPRK23, EIPRK45, eip_method
 
-EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
 SCIPY = {EIPRK23: RK23, EIPRK45: RK45, EIPDOP853: DOP853}
 # Pairs with the package's own steps, whatever the classes do if nothing is projected.
 OWN = {eip_method(cls.TABLEAU): theirs for cls, theirs in SCIPY.items()}

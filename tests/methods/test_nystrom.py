@@ -50,6 +50,8 @@ def test_the_number_of_conditions():
 @pytest.mark.parametrize("tableau", HIGH, ids=name)
 def test_orders(tableau):
     """A tableau that is made again is checked in all conditions; it has no higher order, nor has its estimate."""
+    assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
+    assert (RKN1210.n_stages, RKN1210.order, RKN1210.error_estimator_order, RKN1210.fsal) == (17, 12, 10, False)
     assert NystromTableau("again", **arguments(tableau)).order == tableau.order
     for key in ("order", "error_estimator_order"):
         with pytest.raises(ValueError, match="is not of order"):
@@ -105,22 +107,6 @@ def test_low_parts_of_a_float_tableau():
     values["A"][3][1] += 1e-10
     with pytest.raises(ValueError, match="floats: b is not of order 8"):
         NystromTableau("floats", **values, order=8, error_estimator_order=6)
-
-
-ATTRIBUTES = {"n_stages": [2, 3, 2, 9, 17], "order": [2, 4, 2, 8, 12], "error_estimator_order": [1, None, None, 6, 10]}
-ATTRIBUTES |= {"has_estimate": [True, False, False, True, True], "fsal": [False, False, False, True, False]}
-
-
-def test_attributes():
-    for key, values in ATTRIBUTES.items():
-        assert [getattr(t, key) for t in METHODS] == values
-    assert all("Dormand, El-Mikkawy & Prince" in t.reference for t in HIGH)
-    assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
-    assert repr(METHODS[1]) == "<NystromTableau nystrom4: 3 stages, order 4>"
-    assert not METHODS[1].e.any()
-    assert METHODS[1].b_hat is None
-    with pytest.raises(AttributeError, match="cannot assign"):
-        RKN86.order = 9
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,6 @@ BUTCHER6 = Tableau(
     order=6,
 )
 METHODS = [RK1, RK2, RK3, RK4, RK5, THREE_EIGHTHS, RALSTON, BUTCHER6]
-PAIRS = [t for t in METHODS if t.has_estimate]
 
 
 def name(tableau):
@@ -61,13 +60,11 @@ def test_orders(tableau):
 
 
 def test_attributes():
-    assert [t.n_stages for t in (RK1, RK2, RK3, RK4, RK5)] == [1, 2, 3, 4, 6]
-    assert [t.order for t in (RK1, RK2, RK3, RK4, RK5)] == [1, 2, 3, 4, 5]
-    assert [t.fsal for t in (RK1, RK2, RK3, RK4, RK5)] == [False, False, False, True, False]
+    assert [(t.n_stages, t.order, t.fsal) for t in (RK1, RK3, RK4, RK5)] == [
+        (1, 1, False), (3, 3, False), (4, 4, True), (6, 5, False),
+    ]  # fmt: skip
     assert [t.error_estimator_order for t in (RK1, RK2, RK3, RK4, RK5)] == [None, 1, 2, 3, 4]
     assert [t.metric_exponent for t in (RK1, RK2, RK4)] == [1.0, 1.5, 1.25]
-    assert all("section 2.1" in t.reference for t in (RK1, RK2, RK3, RK4))
-    assert "RK4" in repr(RK4)
     assert "order 4" in repr(RK4)
     assert list(RK4.e) == [0, 0, 0, 1 / 6, -1 / 6]  # err = (h/6)(k4 - f(new))
     with pytest.raises(ValueError, match="read-only"):

@@ -1,8 +1,4 @@
-"""Charged particles: orbits in closed form, the command in small, and the numbers of its page."""
-
-import json
-import math
-from functools import partial
+"""Charged particles: an orbit in closed form, and the numbers of the page."""
 
 import numpy as np
 import pytest
@@ -11,12 +7,10 @@ from pages import assert_printed, printed_tables
 import eip_scipy
 from eip_scipy import EIPDOP853, EIPRK4, integrate
 from eip_scipy.problems import ParticleField, charged_particle, tokamak
-from eip_scipy_studies.cli import main
 from eip_scipy_studies.output import Output
 from eip_scipy_studies.particles import charged_particle as study
 from eip_scipy_studies.particles.orbits import ParticleOrbit
 
-STEPS = 60
 PAGE = "results/charged-particles.md"
 
 
@@ -79,20 +73,3 @@ def test_numbers_of_longer_steps_on_the_page():
         run = integrate(problem, method=method, h=float(step.split()[0]) * problem.h, invariants=kept)
         assert_printed(evaluations, run.nfev)
         assert_printed(error, np.linalg.norm(run.y[:3, -1] - exact))
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_command_in_small(tmp_path, monkeypatch, capsys):
-    """The runs are too short for what the methods do to the orbits, so that these checks fail; H and L are kept."""
-    monkeypatch.setattr(study, "Experiment", partial(study.Experiment, t_end=6 * math.pi))
-    file = tmp_path / "run.json"
-    assert main(["charged-particle", "uniform", "--out", str(tmp_path), "--json", str(file)]) == 1
-    names = {"charged-particle.csv", "charged-particle-uniform.png", "run.json"}
-    assert {path.name for path in tmp_path.iterdir()} == names
-    failed = [check["text"] for check in json.loads(file.read_text())["checks"] if not check["passed"]]
-    assert capsys.readouterr().out.count("FAILED ") == len(failed) > 0
-    assert not any("relative error" in text for text in failed)
-    study.paper_figure(out := Output(tmp_path / "paper", quiet=True), "fig-tokamak")
-    assert list(out.numbers["scenes"]["tokamak-transit"]) == list(study.PAPER)

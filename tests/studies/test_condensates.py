@@ -1,15 +1,15 @@
-"""What the commands `eip-scipy gpe` are made of: ground states, vortices, surfaces, splittings, closed forms."""
+"""What the commands `eip-scipy gpe` are made of: ground states, vortices, splittings."""
 
 import numpy as np
 import pytest
 from orders import observed_order
 
-from eip_scipy import EIPDOP853, EIPRK4, eip_method, integrate
+from eip_scipy import EIPDOP853, eip_method, integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
 
 pytest.importorskip("numba")
 from eip_scipy_studies.condensates.ground_state import ground_state, imprint, polygon, ring_start, thomas_fermi
-from eip_scipy_studies.condensates.problems import harmonic_trap, plane_wave, quartic_trap, soliton
+from eip_scipy_studies.condensates.problems import harmonic_trap, quartic_trap
 from eip_scipy_studies.condensates.splitting import Splitting
 from eip_scipy_studies.condensates.vortices import vortices
 
@@ -69,13 +69,3 @@ def test_splittings_of_a_rotating_condensate(scheme, steps):
     assert errors[-1] < 2e-3
     there = method.one_step(0.0, problem.y0.copy(), 0.05).copy()
     np.testing.assert_allclose(method.one_step(0.05, there, -0.05), problem.y0, atol=1e-12)
-
-
-def test_closed_forms_solve_the_equation():
-    for problem in (soliton(points=512, length=60.0), plane_wave((8, 12), (1, -2), amplitude=1.5)):
-        d, weights = 1e-3, [1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]
-        for t in (0.0, 29.9):  # at 29.9 the soliton crosses the end of the ring
-            rate = sum(a * problem.reference(t + k * d) for a, k in zip(weights, range(-4, 5), strict=True)) / d
-            np.testing.assert_allclose(rate, problem.fun(t, problem.reference(t)), atol=1e-8)
-    run = integrate(problem, method=EIPRK4)
-    assert run.diagnostics.n_rank_reduced == run.diagnostics.n_projections > 0  # a stationary state

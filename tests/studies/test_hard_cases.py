@@ -1,4 +1,4 @@
-"""The hard cases: gradients, invariance, final states, and the command ``eip-scipy hard-cases`` with its bars."""
+"""The hard cases: gradients, invariance, final states, and the command ``eip-scipy hard-cases``."""
 
 import csv
 import json
@@ -56,40 +56,6 @@ def test_end_is_the_solutions(case):
     """SciPy's DOP853 at a tight tolerance, without any code of the package, reaches the same end."""
     sol = solve_ivp(case.problem.fun, case.problem.t_span, case.problem.y0, method="DOP853", rtol=1e-11, atol=1e-13)
     assert case.error(sol.y[:, -1]) < 1e-7
-
-
-def test_drift_is_relative_and_sees_the_largest_change():
-    (case,) = hard_cases(["euler_detest"])
-    moved = case.problem.y0 * 1.001
-    assert case.drift(np.stack([case.problem.y0, moved, case.problem.y0], axis=1)) == pytest.approx(0.002001, rel=1e-6)
-
-
-def made_up(error=1e-8, drift=1e-13, failure=None, others=(1e-8, 1e-13)):
-    """Return 35 comparisons in which projection divides the error by 100, except in the first of them."""
-    first, plain = command.Outcome(math.nan if failure else error, drift, 10, 70, failure), command.Outcome(1e-6, 0.0)
-    rest = [command.Comparison(case, plain, command.Outcome(*others)) for case in CASES[1:]]
-    return [command.Comparison(CASES[0], command.Outcome(1e-8, 0.0), first), *rest]
-
-
-@pytest.mark.parametrize(
-    ("method", "rtol", "metric", "results", "missed"),
-    [
-        ("EIPRK45", 1e-6, "error", made_up(), []),
-        ("EIPRK45", 1e-6, "error", made_up(failure="boom"), ["every run", "no error more than 3 times"]),
-        ("EIPRK45", 1e-6, "error", made_up(error=4e-8), ["no error more than 3 times"]),
-        ("EIPDOP853", 1e-9, "error", made_up(error=1.1e-7), ["no error above 1e-7"]),
-        ("EIPDOP853", 1e-9, "error", made_up(error=4e-8), []),
-        ("EIPRK45", 1e-6, "error", made_up(others=(1e-7, 2e-9)), ["drift", "median", "geometric mean"]),
-        ("EIPRK45", 1e-6, "euclidean", made_up(others=(1e-7, 2e-9)), ["drift", "median"]),
-        ("EIPRK23", 1e-6, "error", made_up(error=1.0, drift=1.0), []),
-    ],
-)
-def test_each_bar_can_fail(method, rtol, metric, results, missed):
-    found = [
-        text for text, passed in command.bars(results, command.summary(results), method, rtol, metric) if not passed
-    ]
-    assert len(found) == len(missed)
-    assert all(text.startswith(start) for text, start in zip(found, missed, strict=True))
 
 
 def test_a_run_that_raises_is_an_outcome_and_a_wrong_invariant_a_loss():
