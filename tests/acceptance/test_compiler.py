@@ -32,13 +32,10 @@ def test_machines_without_a_compiler_bring_one(compiler, monkeypatch, tmp_path):
     # Otherwise zig builds for the processor of this machine.
     assert compiler.chosen().every == ("-mcpu=baseline",)
     assert compiler.chosen().executables["compiler_so_cxx"][:4] == [sys.executable, "-m", "ziglang", "c++"]
-
-
-def test_a_compiler_that_is_too_old_is_passed_over(compiler, monkeypatch, tmp_path):
-    old = tmp_path / "old"
+    old = tmp_path / "old"  # which takes no C++ of today
     old.write_text("#!/bin/sh\nexit 1\n")
     old.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
+    compiler.chosen.cache_clear()
     monkeypatch.setenv("CXX", str(old))
     assert compiler.required() == ["ziglang>=0.17"]
 

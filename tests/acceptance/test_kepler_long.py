@@ -18,18 +18,17 @@ SETTINGS = {"paper": {"metric": "euclidean", "reuse_f": False}, "default": {}}
 
 
 @cache
-def run(method, setting, iterations=1, kept="HL"):
-    options = {"method": method, "h": H, "save_every": SAVE_EVERY, "iterations": iterations, **SETTINGS[setting]}
+def run(method, setting, kept="HL"):
+    options = {"method": method, "h": H, "save_every": SAVE_EVERY, **SETTINGS[setting]}
     invariants = [item for item in PROBLEM.invariants if item.name in kept]
     return integrate(PROBLEM, (0, T), invariants=invariants, **options)
 
 
 def values(result):
-    """Return H and L at the saved states, also if they are not kept, and the sum of the sizes of their terms."""
+    """Return H and L at the saved states, also if they are not kept."""
     q1, q2, p1, p2 = result.y
     r = np.hypot(q1, q2)
-    terms = np.array([[0.5 * (p1**2 + p2**2), -1 / r - 0.0025 / r**3], [q1 * p2, -q2 * p1]])
-    return terms.sum(axis=1), np.abs(terms).sum(axis=1)
+    return np.array([0.5 * (p1**2 + p2**2) - 1 / r - 0.0025 / r**3, q1 * p2 - q2 * p1])
 
 
 def check_no_drift(t, residuals):
@@ -60,27 +59,11 @@ def test_residuals_are_stationary(method, setting, largest):
     check_no_drift(result.t, result.invariants - result.invariants[:, :1])
 
 
-@pytest.mark.parametrize("setting", ["paper", "default"])
-def test_two_newton_steps_reach_round_off(setting):
-    """1e-15 of the invariants in the mean, and of the size of their terms at worst.
-
-    At the pericentre H = -0.54 is the difference of terms whose sizes add up to 4.5, so that its rounding there is 8
-    times as large, relative to H itself. A residual up to 4 eps times the terms of G y, 6e-15 there, is not corrected.
-    """
-    result = run(EIPRK4, setting, iterations=2)
-    residuals = result.invariants - result.invariants[:, :1]
-    rms = np.sqrt(np.mean(residuals**2, axis=1))
-    assert (rms / np.abs(result.invariants[:, 0]) < 1e-15).all()
-    assert (np.abs(residuals) < 2e-15 * values(result)[1]).all()
-    assert (result.max_residual < (7e-15, 2e-15)).all()
-    check_no_drift(result.t, residuals)
-
-
 @pytest.mark.parametrize(("kept", "other"), [("H", 1), ("L", 0)])
 def test_the_invariant_that_is_not_kept_drifts(kept, other):
     """The check for drift is meaningful: the paper's EIP-H and EIP-L fail the same test by orders of magnitude."""
     result = run(EIPRK4, "paper", kept=kept)
-    residuals = values(result)[0]
+    residuals = values(result)
     residuals = residuals - residuals[:, :1]
     fit = linregress(result.t, residuals[other])
     assert abs(fit.slope) > 50 * fit.stderr

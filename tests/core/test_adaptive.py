@@ -154,6 +154,17 @@ def test_options_of_both_drivers(option):
         assert np.array_equal(bare.y[:, -1], found.y[:, -1]) != has_effect
 
 
+def test_zero_length_interval():
+    for method in (*METHODS, EIPRK2):
+        options = {"method": method, "dense_output": True, "events": lambda t, y: y[0]}
+        found = run(t_span=(2.0, 2.0), invariants=[H, L], **options)
+        assert found.status == 0
+        assert set(found.t.tolist()) == {2.0}
+        assert (found.y == Y0[:, None]).all()
+        assert found.njev == found.t_events[0].size == 0
+        np.testing.assert_array_equal(found.sol(2.0), Y0)
+
+
 @pytest.mark.parametrize("driver", [run, solve_ivp])
 @pytest.mark.parametrize("rtol", [0.0, [1e-3, 1e-20, 1e-3, 1e-3]])
 def test_rtol_too_small_warns_as_scipy_s(driver, rtol):

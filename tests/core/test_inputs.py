@@ -41,10 +41,6 @@ def by_scipy(**options):
     return solve_ivp(oscillator, options.pop("t_span"), options.pop("y0"), **options)
 
 
-def by_ensemble(**options):
-    return ensemble(oscillator, (0, 1), **{"y0s": [Y0, Y0], "method": EIPRK4, "h": 0.1, "compiled": False, **options})
-
-
 @pytest.mark.parametrize(
     ("call", "name", "value"),
     [
@@ -61,7 +57,7 @@ def by_ensemble(**options):
         (by_integrate, "rtol", 1e-3 * units.AU),
         (by_scipy, "y0", Y0 * units.AU),
         (by_scipy, "first_step", 0.1 * units.s),
-        (by_ensemble, "y0s", [Y0, Y0] * units.AU),
+        (lambda y0s: ensemble(oscillator, (0, 1), y0s, method=EIPRK4, h=0.1), "y0s", [Y0, Y0] * units.AU),
         (lambda y_hat: project(y_hat, SQUARE, target=1.0), "y_hat", Y0 * units.AU),
         (lambda gm: nbody(**BODIES | {"gm": gm}), "gm", [1, 2] * units.kg),
         (lambda epoch: nbody(**BODIES, epoch=epoch), "epoch", Time(2451545.0, format="jd")),

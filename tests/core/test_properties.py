@@ -90,20 +90,6 @@ def test_order_of_invariants_and_components(seed, size, iterations):
     np.testing.assert_allclose(permuted[back], plain, rtol=0, atol=1e-11)
 
 
-@given(seeds, sizes, st.integers(1, 2))
-@few
-def test_units_of_the_components(seed, size, iterations):
-    """Weights in each component's own unit: the same correction, in that unit, over 24 decades."""
-    q = Quadratics(seed, *size)
-    n = size[0]
-    unit, sigma = 10.0 ** q.rng.uniform(-12, 12, n), 10.0 ** q.rng.uniform(-2, 0, n)
-    assume(q.well_conditioned(sigma))
-    plain = project(q.y_hat, q.invariant(), sigma=sigma, iterations=iterations).y
-    scaled = Invariant(lambda t, z: q.value(t, z / unit), lambda t, z: q.grad(t, z / unit) / unit, target=q.target)
-    z = project(q.y_hat * unit, scaled, sigma=sigma * unit, iterations=iterations).y
-    np.testing.assert_allclose(z / unit, plain, rtol=0, atol=1e-11)
-
-
 def random_frame(rng, n, k):
     C, S = rng.standard_normal((k, n)), rng.standard_normal((n, k))
     return C, S, np.eye(n) - S @ np.linalg.solve(C @ S, C)

@@ -20,7 +20,7 @@ from gala.potential import (  # noqa: E402
 from gala.potential.common import PotentialParameter  # noqa: E402
 from gala.units import dimensionless, galactic  # noqa: E402
 
-from eip_scipy.integrations.gala import _conserved, _System, integrate_orbit  # noqa: E402
+from eip_scipy.integrations.gala import integrate_orbit  # noqa: E402
 
 W = np.array([8.0, 0.0, 0.5, 0.03, 0.2, 0.05])
 HALO = CCompositePotential(
@@ -47,21 +47,16 @@ class Ring(PotentialBase):
 
 
 @pytest.mark.parametrize(
-    ("hamiltonian", "kept"),
+    ("hamiltonian", "turns"),
     [
-        (HALO, ["energy", "L_z"]),
-        (Hamiltonian(HALO, ConstantRotatingFrame([10, 0, 40] * u.km / u.s / u.kpc, units=galactic)), ["energy"]),
-        (Hamiltonian(BAR, ConstantRotatingFrame(SPEED, units=galactic)), ["energy"]),
+        (HALO, True),
+        (Hamiltonian(HALO, ConstantRotatingFrame([10, 0, 40] * u.km / u.s / u.kpc, units=galactic)), False),
+        (Hamiltonian(BAR, ConstantRotatingFrame(SPEED, units=galactic)), False),
     ],
 )
-def test_orbits(hamiltonian, kept):
-    """In each frame: gala's derivative and energy, its orbit at tight tolerances, and what is kept."""
+def test_orbits(hamiltonian, turns):
+    """In each frame: gala's orbit at tight tolerances, its energy, and the angular momentum where it is kept."""
     h = Hamiltonian(hamiltonian)
-    system = _System(h)
-    at = np.zeros(1)
-    assert np.allclose(system(0.0, W), h._gradient(np.ascontiguousarray(W[:, None]), at)[:, 0], rtol=1e-15, atol=1e-18)
-    assert system.energy(0.0, W) == pytest.approx(h._energy(W[None], at)[0], rel=1e-14)
-    assert [item.name for item in _conserved(system, W, np.array([0.0, 2000.0]))] == kept
     w0 = PhaseSpacePosition.from_w(np.stack([W, 1.1 * W], axis=-1), galactic)
     orbits = integrate_orbit(h, w0, **TIMES)
     assert orbits.shape == (401, 2)
@@ -73,12 +68,12 @@ def test_orbits(hamiltonian, kept):
 
     def spread(found):
         w = found.w(galactic)
-        energies = [h._energy(np.ascontiguousarray(w[:, :, k].T), at) for k in range(2)]
+        energies = [h._energy(np.ascontiguousarray(w[:, :, k].T), np.zeros(1)) for k in range(2)]
         return np.abs(np.ptp(energies, axis=1) / np.mean(energies, axis=1)).max()
 
     assert spread(orbits) < 1e-11
     assert spread(usual) > 1e-9
-    if "L_z" in kept:
+    if turns:
         assert np.ptp(orbits.angular_momentum()[2], axis=0).value.max() < 1e-13
 
 

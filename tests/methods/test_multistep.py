@@ -14,7 +14,6 @@ from eip_scipy.methods.gauss_jackson import (
     position_weights,
     stability_limit,
     velocity_series,
-    velocity_weights,
     weights,
 )
 
@@ -29,38 +28,6 @@ def test_published_coefficients():
     assert position_series(-1, 8) == [Fraction(c) for c in stormer]
     assert position_series(0, 8) == [Fraction(c) for c in cowell]
     assert velocity_series(0, 8) == [Fraction(c) for c in moulton]
-
-
-def missed_by_position(back, order, k):
-    """Return the residual of q = t^(k + 2), by second differences, which remove the sums: exact fractions."""
-
-    def a(n):
-        return (k + 2) * (k + 1) * Fraction(n) ** k
-
-    def q(n):
-        return Fraction(n) ** (k + 2)
-
-    sums = a(0) - (1 + back) * (a(0) - a(-1))  # of S - (1 + back) s
-    formula = position_weights(back, order)
-    rest = sum(w * (a(-j) - 2 * a(-j - 1) + a(-j - 2)) for j, w in enumerate(formula))
-    return q(-back) - 2 * q(-back - 1) + q(-back - 2) - sums - rest
-
-
-def missed_by_velocity(back, order, k):
-    """Return the residual of v = t^(k + 1) / (k + 1), by first differences."""
-    change = sum(w * (Fraction(-j) ** k - Fraction(-j - 1) ** k) for j, w in enumerate(velocity_weights(back, order)))
-    later, earlier = (Fraction(n) ** (k + 1) / (k + 1) for n in (-back, -back - 1))
-    return later - earlier - Fraction(0) ** k - change
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_exact_for_polynomials_up_to_the_order(order):
-    """All formulas are exact for accelerations t^k, k < order; the predictor and the velocity's for no higher ones."""
-    for k in range(order):
-        assert [missed_by_position(back, order, k) for back in (-1, 0, 1, order // 2, order - 1)] == [0] * 5
-        assert [missed_by_velocity(back, order, k) for back in (0, 1, order // 2, order - 1)] == [0] * 4
-    assert missed_by_position(-1, order, order + 2) != 0  # what is missed of t^(order + 2) the differences take out
-    assert missed_by_velocity(0, order, order + 1) != 0
 
 
 @pytest.mark.parametrize("order", ORDERS)

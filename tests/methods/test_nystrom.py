@@ -53,6 +53,8 @@ def test_orders(tableau):
     assert repr(RKN86) == "<NystromTableau RKN86: 9 stages, order 8, estimate of order 6>"
     assert (RKN1210.n_stages, RKN1210.order, RKN1210.error_estimator_order, RKN1210.fsal) == (17, 12, 10, False)
     assert NystromTableau("again", **arguments(tableau)).order == tableau.order
+    with pytest.raises(AttributeError, match="cannot assign"):
+        tableau.order = 9
     for key in ("order", "error_estimator_order"):
         with pytest.raises(ValueError, match="is not of order"):
             NystromTableau("higher", **arguments(tableau) | {key: arguments(tableau)[key] + 1})

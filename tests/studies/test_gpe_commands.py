@@ -1,4 +1,4 @@
-"""`eip-scipy gpe` on small grids: checks, interruptions, and states that do not belong."""
+"""`eip-scipy gpe` on small grids: interruptions, and states that do not belong."""
 
 import csv
 from dataclasses import replace
@@ -11,7 +11,7 @@ from eip_scipy import integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.condensates import quench, states
-from eip_scipy_studies.condensates.ground_state import GroundState, ground_state, imprint
+from eip_scipy_studies.condensates.ground_state import ground_state, imprint
 from eip_scipy_studies.condensates.problems import quartic_trap
 from eip_scipy_studies.output import Output
 from eip_scipy_studies.report import UsageError
@@ -22,17 +22,6 @@ pytestmark = pytest.mark.needs_jit
 def read(file):
     with open(file, newline="") as stream:
         return list(csv.DictReader(stream))
-
-
-def known(energy, converged=True):
-    gpe = GrossPitaevskii(Grid((16, 16), -5, 5), Omega=0.8, beta=100)
-    psi = np.exp(-sum(a**2 for a in gpe.grid.mesh())).astype(complex)
-    return states.Found("Omega", gpe, GroundState(psi, energy, 1.0, 1e-9, 5, converged, "stopped"), 3.1904172)
-
-
-def test_checks_of_ground_states():
-    items = [known(3.190426), known(3.190437), known(3.1), known(3.1, converged=False)]
-    assert [check[-1] for check in states.checks({"trap": items})] == [True, False, True, False]
 
 
 def small_ring(kappa=0.3):

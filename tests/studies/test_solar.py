@@ -6,12 +6,8 @@ import math
 import sys
 from fractions import Fraction
 
-import numpy as np
 import pytest
 
-from eip_scipy.integrations import jpl
-from eip_scipy.problems import solar_data
-from eip_scipy.problems import solar_system as problem_of
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import command, cost, runs
 from eip_scipy_studies.solar.epoch import parse_epoch
@@ -119,13 +115,6 @@ def test_epochs_without_loss(text, julian_date):
 def test_other_epochs_are_refused(text):
     with pytest.raises(ValueError, match=r"no such date|\"2451545\.0\", got"):
         parse_epoch(text)
-
-
-@pytest.mark.parametrize(("text", "name"), [("2014-02-02T20:18", "de440"), ("JD2451545.0", "de440-j2000")])
-def test_epochs_of_the_package_bit_for_bit(kernel, text, name):
-    data, packaged = jpl.initial_data(parse_epoch(text)), solar_data.load(name)
-    np.testing.assert_array_equal(data.y0, packaged.y0)
-    assert (problem_of(data).reference(100.0) is None) == (name != "de440")
 
 
 @pytest.mark.usefixtures("few_methods")
