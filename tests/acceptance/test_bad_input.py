@@ -205,6 +205,7 @@ WRONG_TOGETHER = [
     ({"h": None, "method": EIPRK1}, ValueError, "EIPRK1 has no error estimate and needs the step h="),
     ({"t_eval": [0.2, 0.5], "t_span": (1, 0)}, ValueError, "`t_eval` are not properly sorted"),
     ({"t_eval": [0.5], "save_every": 1}, ValueError, "save_every or t_eval, not both"),
+    ({"h": 1e-12, "save_every": 1}, MemoryError, "by default half of the free memory"),
     ({"h": None, "method": EIPRK45, "first_step": 11.0}, ValueError, "`first_step` exceeds bounds"),
     ({"h": None, "method": EIPRK45, "first_step": math.inf}, ValueError, "`first_step` exceeds bounds"),
     *(
