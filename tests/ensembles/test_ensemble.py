@@ -13,12 +13,9 @@ import pytest
 from numba import njit
 from systems import (
     SQUARE,
-    H,
-    L,
     jit_energy,
     jit_energy_gradient,
     jit_orbit,
-    orbit,
     oscillator,
     pericentre,
     refuse,
@@ -91,13 +88,6 @@ def test_a_start_off_the_target():
     missed = ensemble(jit_orbit, SPAN, y0s, method=EIPRK4, h=0.03, invariants=TARGET)
     assert missed.failed.tolist() == [1, 2]
     assert "the start violates invariant 'H'" in missed.message[1]
-
-
-def test_interpreted_members():
-    y0s, options = starts(3), {"method": EIPRK4, "h": 0.1, "invariants": [H, L], "save_every": 20}
-    run = ensemble(orbit, SPAN, y0s, **options)
-    same_members(run, lambda k: integrate(orbit, SPAN, y0s[k], **options))
-    assert "(interpreted: " in run.message[0]
 
 
 # Nothing passes from member to member, nor from worker to worker.

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from eip_scipy import EIPRK4, check_gradient, find_invariants, hamiltonian, integrate
 from eip_scipy.problems import kepler as kepler_problem
-from eip_scipy_studies.hard_cases import hard_cases
 
 E = np.eye(6)
 
@@ -201,23 +200,6 @@ def test_tops(inertia, centre, more):
     ]
     found = find_invariants(top(np.array(inertia), centre), SPINNING, degree=4 if more else 2)
     assert spans(found, known, np.random.default_rng(0).normal(size=(5, 6)))
-
-
-HOW_MANY = {  # of a hard case's invariants are polynomials of degree 2
-    "kepler_e0999": 1, "kepler_si": 1, "arenstorf": 0, "euler_top_tennis": 2, "euler_detest": 2, "quaternion": 1,
-    "sir": 1, "volterra_lattice": 2, "vortices": 3, "schwarzschild": 2, "brockett": 2, "double_pendulum": 0,
-    "tokamak": 1,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", HOW_MANY)
-def test_hard_cases(name):
-    ((case),) = hard_cases([name])
-    found = find_invariants(case.problem.fun, case.problem.y0)
-    f = case.problem.fun(0.0, case.problem.y0)
-    terms = [item.grad(0.0, case.problem.y0) * f for item in found]
-    assert len(found) == HOW_MANY[name]
-    assert all(abs(row.sum()) <= 1e-12 * np.abs(row).sum() for row in terms)
 
 
 # Properties of random systems y' = S grad H(y), with an antisymmetric matrix S, and H a polynomial.

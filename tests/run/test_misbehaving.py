@@ -195,11 +195,11 @@ def test_functions_that_stop_filling(how):
 # Values that change on the way.
 
 CHANGES = {
-    "complex": (lambda y: y + 0j, ValueError, "complex"),
-    "text": (lambda y: "1.0", TypeError, "'1.0'"),
-    "None": (lambda y: None, TypeError, "None"),
-    "shape": (lambda y: np.ones((3, 1)), ValueError, r"shape \(3, 1\)"),
-    "ragged": (lambda y: [1.0, [2.0, 3.0]], (TypeError, ValueError), r"\[1.0, \[2.0, 3.0\]\]"),
+    "complex": (lambda y: y + 0j, "complex"),
+    "text": (lambda y: "1.0", "'1.0'"),
+    "None": (lambda y: None, "None"),
+    "shape": (lambda y: np.ones((3, 1)), r"shape \(3, 1\)"),
+    "ragged": (lambda y: [1.0, [2.0, 3.0]], r"\[1.0, \[2.0, 3.0\]\]"),
 }
 
 
@@ -207,36 +207,17 @@ def late(good, change):
     return lambda t, y: good(t, y) if t < 0.5 else change(y)
 
 
-def check_error(how, info):
-    """Check that the error names the time, and that computed results are kept."""
-    assert re.search(r"at t=0\.5\b", str(info.value))
-    if how is interpreted:
-        assert info.value.partial.t[-1] == 0.4
-
-
-@pytest.mark.parametrize("how", [interpreted, scipy_s])
-def test_right_hand_sides_that_change(how):
-    for change, error, match in CHANGES.values():
-        with pytest.raises(error, match=f"fun returned .*{match}") as info:
-            how(late(oscillator, change))
-        check_error(how, info)
-
-
-@pytest.mark.parametrize("part", ["value", "gradient"])
-def test_invariants_that_change(part):
-    for change, *_ in CHANGES.values():
-        value = late(square, change) if part == "value" else square
-        gradient = late(square_gradient, change) if part == "gradient" else square_gradient
-        with pytest.raises((TypeError, ValueError), match=r"invariant 'S' (returned|has|is)") as info:
-            interpreted(invariants=Invariant(value, gradient, name="S"))
-        check_error(interpreted, info)
-
-
-def test_events_that_change():
-    for value, start in product([None, 1j, "1.0", [1.0]], [-1.0, 0.5]):
-        with pytest.raises(TypeError, match=r"event 0 returned .*expected a real number") as info:
-            interpreted(events=lambda t, y, v=value, start=start: y[0] if t < start else v)
-        assert info.value.partial.t[-1] == pytest.approx(max(start, 0.0))
+def test_values_that_change():
+    """The error names the time, and computed results are kept."""
+    for change, match in CHANGES.values():
+        calls = [(how, {"fun": late(oscillator, change)}, f"fun returned .*{match}") for how in (interpreted, scipy_s)]
+        for functions in ((late(square, change), square_gradient), (square, late(square_gradient, change))):
+            calls.append((interpreted, {"invariants": Invariant(*functions, name="S")}, "'S' (returned|has|is)"))
+        for how, options, words in calls:
+            with pytest.raises((TypeError, ValueError), match=words) as info:
+                how(**options)
+            assert re.search(r"at t=0\.5\b", str(info.value))
+            assert how is scipy_s or info.value.partial.t[-1] == 0.4
 
 
 # Exceptions before the first step.
