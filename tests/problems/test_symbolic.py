@@ -359,6 +359,7 @@ WRONG = {
         (("p**2", "q r", "p a-b"), ValueError, "'a-b' is not a name"),
         (("p**2", "t", "p"), ValueError, "t is the time"),
         (("p**2", 3, "p"), TypeError, "expected names"),
+        (("p**2", [3], "p"), TypeError, "expected names"),
         (("p**2*k", "q", "p"), ValueError, "contains k, which is neither"),
         (("a**2", "q", "p", {"params": {"a": 1}}), ValueError, "does not depend on q, p"),
         (("p**2", "q", "p", {"params": {"q": 1}}), ValueError, "of the state and of a parameter"),

@@ -290,7 +290,9 @@ def test_a_run_that_starts_beyond_a_limit_ends_there(direction, native):
     fun = njit(oscillator) if native else oscillator
     one, other = np.array([0.6, 0.1]), np.array([0.4, 0.0])
     for t_span in ((0, 9), (9, 0)):
-        for run in (integrate(fun, t_span, one, **options), solve_ivp(fun, t_span, one, **options)):
+        for solve in (integrate, solve_ivp):
+            run = solve(fun, t_span, one, dense_output=True, **options)
+            np.testing.assert_array_equal(run.sol(t_span[0]), one)
             assert (run.status, run.t[-1], run.t_events[0].tolist()) == (1, t_span[0], [t_span[0]])
             np.testing.assert_array_equal(run.y[:, -1], one)
         many = ensemble(fun, t_span, [one, other], executor=1, **options)

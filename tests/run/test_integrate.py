@@ -26,7 +26,6 @@ from eip_scipy import (
     project,
 )
 from eip_scipy.problems import Problem, kepler
-from eip_scipy.results import IntegrationResult
 
 EPS = np.finfo(float).eps
 Y0 = np.array([1.0, 2.0])
@@ -75,20 +74,6 @@ def test_an_autonomous_system_does_not_see_the_time(method, how):
         assert far.t[-1] == end
         members = ensemble(t_span=(t0, end), y0s=np.tile(Y0, (8, 1)), **options)
         np.testing.assert_array_equal(members.y[3], far.y[:, -1])
-
-
-def test_fields():
-    result = run(invariants=[SQUARE, PAIR], save_every=2)
-    assert isinstance(result, IntegrationResult)
-    assert [result[name].shape for name in ("t", "y", "invariants", "max_residual")] == [(6,), (2, 6), (3, 6), (3,)]
-    np.testing.assert_array_equal(result.invariants[0], (result.y**2).sum(axis=0))
-    assert (result.status, result.success, result.method, result.h) == (0, True, "EIPRK4", 0.1)
-    assert "end of the interval" in result.message
-    assert result.t_events is result.y_events is None
-    assert 0 < result.wall_time < 10
-    none = run(save_every=1)
-    assert (none.invariants.shape, none.max_residual.shape, none.njev, none.nlu) == ((0, 11), (0,), 0, 0)
-    assert none.diagnostics.names == ()
 
 
 # Interpolation.

@@ -55,12 +55,6 @@ KEPT = Invariant(square, square_gradient, name="S")
 # Functions that write to what they are given.
 
 
-def writing(t, y):
-    f = np.array([y[1], -y[0]])
-    y[0] = 1e9
-    return f
-
-
 def writing_now_and_then(t, y):
     if t > 0.55:
         y[:] = 7.0 * y
@@ -92,7 +86,7 @@ def gradient_that_writes(t, y):
     return y
 
 
-WRITERS = [writing, writing_now_and_then, writing_by_a_function]
+WRITERS = [writing_now_and_then, writing_by_a_function]
 
 
 @pytest.mark.nightly
@@ -136,10 +130,10 @@ def test_gradients_that_write_to_f(how):
 def test_helpers_keep_what_they_are_given():
     writer = Invariant(value_that_writes, gradient_that_writes, target=5.1, name="S")
     y = np.array(Y0)
-    result = project(y, writer, f=writing)
+    result = project(y, writer, f=writing_by_a_function)
     np.testing.assert_array_equal(y, Y0)
     np.testing.assert_array_equal(result.y, project(y, Invariant(square, square_gradient, target=5.1)).y)
-    assert check_gradient(writer, 0.0, y, writing) < 1e-9
+    assert check_gradient(writer, 0.0, y, writing_by_a_function) < 1e-9
     np.testing.assert_array_equal(y, Y0)
 
 
@@ -190,6 +184,18 @@ def test_functions_that_stop_filling(how):
     assert run.status == -1
     assert run.message.startswith("fun returned a non-finite value at t=0.5 (component 1 is NaN; with in_place=True")
     np.testing.assert_array_equal(run.y, interpreted().y[:, : run.t.size])
+
+
+@both
+def test_an_invariant_that_raises_ends_the_run_with_its_error(how):
+    def late_error(t, y):
+        if t > 0.55:
+            raise ZeroDivisionError("late")
+        return y[0] * y[0] + y[1] * y[1]
+
+    with pytest.raises(ZeroDivisionError, match="late") as caught:
+        how(invariants=Invariant(late_error, square_gradient, name="S"), check=False)
+    assert 0.4 <= caught.value.partial.t[-1] <= 0.6
 
 
 # Values that change on the way.

@@ -172,6 +172,16 @@ def test_interpolants_are_hermite_s(method):
     np.testing.assert_allclose(found.sol(times), expected, rtol=0, atol=2e-14)
 
 
+@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+def test_interpolants_join_the_states_from_which_steps_continue(method):
+    """Steps of the class, which SciPy's loop takes, and of `integrate`, of which one in three is projected."""
+    options = {"rtol": 1e-2, "first_step": 0.05, "max_step": 0.05, "dense_output": True, "every": 3}
+    options |= {"method": method, "invariants": PROBLEM.invariants}
+    stepped = solve_ivp(PROBLEM.fun, (0, 3), PROBLEM.y0, **options)
+    looped = integrate(PROBLEM.fun, (0, 3), PROBLEM.y0, compiled=False, linear_invariants=None, **options)
+    np.testing.assert_array_equal(stepped.sol(np.linspace(0, 3, 501)), looped.sol(np.linspace(0, 3, 501)))
+
+
 # Output lies on the manifold, however seldom the steps are projected.
 
 SELDOM = {

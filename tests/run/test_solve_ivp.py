@@ -171,7 +171,6 @@ def test_what_is_missing():
         ({"fun": spring}, TypeError, "t_span is missing"),
         ({"fun": spring, "t_span": (0, 1)}, TypeError, "y0 is missing"),
         ({"fun": spring, "acceleration": spring}, TypeError, "fun or acceleration, not both"),
-        ({"acceleration": 3}, TypeError, "acceleration must be callable, got 3"),
         ({"fun": kepler()}, TypeError, r"fun must be callable, got .*problem\.solve_ivp"),
     ]
     refuse(solve_ivp, rows)
