@@ -6,7 +6,7 @@ import re
 import numpy as np
 from numba import njit
 
-from eip_scipy import Invariant
+from eip_scipy import Balance, Invariant
 
 AU_KM, DAY_S, YEAR_D = 149597870.7, 86400.0, 365.25  # IAU 2012 Resolution B2, and the Julian year
 
@@ -134,6 +134,55 @@ SPIN_NORM = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name=
 SPIN_START = np.array([0.8, 0.6j, 0.1 - 0.2j])
 
 
+# A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
+# Its energy is a balance, whose rate is given in several ways, or found.
+QUARTIC_PARAMS, QUARTIC_START = np.array([1e-3, 0.3]), np.array([1.0, 0.3])
+
+
+@njit
+def swinging(t, y, p):
+    return np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3])
+
+
+@njit
+def quartic_energy(t, y, p):
+    return 0.5 * y[1] ** 2 + 0.5 * (1 + p[0] * np.sin(p[1] * t)) * y[0] ** 2 + 0.25 * y[0] ** 4
+
+
+@njit
+def quartic_gradient(t, y, p):
+    return np.array([(1 + p[0] * np.sin(p[1] * t)) * y[0] + y[0] ** 3, y[1]])
+
+
+@njit
+def quartic_rate(t, y, p):
+    return 0.5 * p[0] * p[1] * np.cos(p[1] * t) * y[0] ** 2
+
+
+@njit
+def quartic_rate_by_f(t, y, f, p):
+    return y[1] * f[1] + (1 + p[0] * np.sin(p[1] * t)) * y[0] * f[0] + y[0] ** 3 * f[0] + quartic_rate(t, y, p)
+
+
+@njit
+def quartic_gradient_by_f(t, y, f, p):
+    return np.array([-f[1], f[0]])
+
+
+@njit
+def quartic_pair(t, y, p):
+    return np.array([quartic_energy(t, y, p), 2 * quartic_energy(t, y, p)])
+
+
+BALANCES = {
+    "rate": Balance(quartic_energy, quartic_rate, quartic_gradient, name="H"),
+    "f": Balance(quartic_energy, quartic_rate_by_f, quartic_gradient_by_f, name="H", uses_f=True),
+    "gradient": Balance(quartic_energy, grad=quartic_gradient, name="H"),
+    "values": Balance(quartic_energy, name="H"),
+    "pair": Balance(quartic_pair, name="H"),
+}
+
+
 def van_der_pol(t, y, mu=5.0):
     return np.array([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])
 
@@ -160,7 +209,7 @@ def same(one, *others):
                 np.testing.assert_array_equal(a, b, err_msg=key)
         for key in ("names", "n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections"):
             assert getattr(one.diagnostics, key) == getattr(other.diagnostics, key), key
-        for key in ("last_residual", "max_residual", "max_correction"):
+        for key in ("last_residual", "max_residual", "max_correction", "slowness"):
             np.testing.assert_array_equal(getattr(one.diagnostics, key), getattr(other.diagnostics, key), err_msg=key)
         assert one.message.split(" (")[0] == other.message.split(" (")[0]
 

@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from numba import njit
 from systems import same_fields
 
 from eip_scipy import EIPDOP853, EIPRK4, Invariant, ensemble, integrate, load
@@ -39,35 +40,60 @@ def pairs(run, **options):
             yield k, integrate(PROBLEM, SPAN, start, **options)
 
 
-def assert_rows_are(run, k, alone):
-    """The saved rows are those of the single run, and nan after its end."""
-    rows = alone.t.size
-    np.testing.assert_array_equal(run.trajectories[k, :, :rows], alone.y)
-    np.testing.assert_array_equal(run.invariants[k, :, :rows], alone.invariants)
-    assert np.isnan(run.trajectories[k, :, rows:]).all()
-    assert np.isnan(run.invariants[k, :, rows:]).all()
+def seen(run):
+    """Return numbers from all fields of a result that do not need the run itself, for ``reduce=``."""
+    counts = [run.nfev, run.njev, run.nlu, run.status, run.success, run.trusted, run.t.size]
+    events = [] if run.t_events is None else [t.size for t in run.t_events] + [t.sum() for t in run.t_events]
+    sums = [run.t.sum(), *run.y.sum(axis=1), *run.invariants.sum(axis=1), *run.target, *run.max_residual]
+    return np.array([*counts, *events, *sums, run.t[-1], *run.y[:, -1], *run.y.max(axis=1), len(run.message)])
 
 
-# Values of the invariants.
+JITTED = [njit(event) for event in EVENTS]
+JITTED[1].terminal = 2
+TIMES, ADAPTIVE = {"t_eval": np.linspace(1.0, 7.0, 5)}, {"method": EIPDOP853, "rtol": 1e-8}
+MEMBERS = {
+    "in vectors": STEPS,
+    "interpreted": STEPS | {"compiled": False},
+    "steps": STEPS | {"save_every": 40},
+    "times": STEPS | TIMES,
+    "adaptive": ADAPTIVE | TIMES,
+    "events": STEPS | {"events": EVENTS, "compiled": False},
+    "adaptive, events": ADAPTIVE | {"events": EVENTS, "compiled": False},
+    "events and times": STEPS | TIMES | {"events": EVENTS},
+    "jitted events": STEPS | {"events": JITTED},
+    "adaptive, jitted events": ADAPTIVE | {"events": JITTED},
+}
 
 
-@pytest.mark.parametrize("options", [STEPS, STEPS | {"compiled": False}], ids=["in vectors", "interpreted"])
-def test_invariants_of_last_states(options):
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.needs_jit if "jit" in name else ()) for name in MEMBERS]
+)
+def test_members_and_what_reduce_gets_are_single_runs(name):
+    options = MEMBERS[name]
     run = ensemble(PROBLEM, SPAN, STARTS, **options)
-    assert bool(run.side_by_side.any()) is (options is STEPS)
-    assert run.invariants.shape == run.target.shape == (len(STARTS), 2)
+    reduced = ensemble(PROBLEM, SPAN, STARTS, reduce=seen, chunk=8, **options)
+    assert run.side_by_side.any() == (name in ("in vectors", "steps", "times"))
+    assert reduced.trajectories is None
+    assert np.isnan(reduced.reduced[FAILING]).all()
+    saved = run.times.size > 0
     for k, alone in pairs(run, **options):
-        np.testing.assert_array_equal(run.invariants[k], alone.invariants[:, -1])
+        np.testing.assert_array_equal(reduced.reduced[k], seen(alone))
+        assert (run.status[k], run.t[k]) == (alone.status, alone.t_events[1][-1] if alone.status else SPAN[1])
         np.testing.assert_array_equal(run.target[k], alone.target)
-
-
-@pytest.mark.parametrize("more", [{"save_every": 40}, {"t_eval": np.linspace(1.0, 7.0, 5)}])
-def test_invariants_of_saved_states(more):
-    run = ensemble(PROBLEM, SPAN, STARTS, **STEPS, **more)
-    assert run.side_by_side.any()
-    assert run.invariants.shape == (len(STARTS), 2, run.times.size)
-    for k, alone in pairs(run, **STEPS, **more):
-        assert_rows_are(run, k, alone)
+        rows = alone.t.size
+        for found, own in ((run.trajectories, alone.y), (run.invariants, alone.invariants)) if saved else ():
+            np.testing.assert_array_equal(found[k, :, :rows], own)
+            assert np.isnan(found[k, :, rows:]).all()
+        if not saved:
+            np.testing.assert_array_equal(run.y[k], alone.y[:, -1])
+            np.testing.assert_array_equal(run.invariants[k], alone.invariants[:, -1])
+        for found, own in (
+            ((run.t_events, alone.t_events), (run.y_events, alone.y_events)) if "events" in options else ()
+        ):
+            for i in range(2):
+                np.testing.assert_array_equal(found[k][i].ravel(), own[i].ravel())
+    if "events" in options:
+        assert ([t.size for t in run.t_events[0]], run.status[0]) == ([1, 2], 1)
 
 
 def test_invariants_with_parameters_for_each_member():
@@ -85,62 +111,6 @@ def test_invariants_with_parameters_for_each_member():
     )
     np.testing.assert_allclose(run.invariants, stiffness / 2, rtol=1e-11)
     np.testing.assert_array_equal(run.target, stiffness / 2)
-
-
-# Events.
-
-
-@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
-@pytest.mark.parametrize("steps", [STEPS, {"method": EIPDOP853, "rtol": 1e-8}], ids=["fixed", "adaptive"])
-def test_events_of_members_are_those_of_single_runs(compiled, steps):
-    events = EVENTS
-    if compiled:
-        from numba import njit
-
-        events = [njit(event) for event in EVENTS]
-        events[1].terminal = 2
-    options = steps | {"events": events, "compiled": compiled}
-    run = ensemble(PROBLEM, SPAN, STARTS, **options)
-    for k, start in enumerate(STARTS):  # also of the member that fails
-        alone = integrate(PROBLEM, SPAN, start, **options)
-        assert (run.status[k], run.t[k]) == (alone.status, alone.t[-1])
-        for i in range(2):
-            np.testing.assert_array_equal(run.t_events[k][i], alone.t_events[i])
-            np.testing.assert_array_equal(run.y_events[k][i].reshape(-1, 4), alone.y_events[i].reshape(-1, 4))
-    assert [t.size for t in run.t_events[0]] == [1, 2]
-    assert run.status[0] == 1
-
-
-# The result of each member for ``reduce=``.
-
-
-def seen(run):
-    """Return numbers from all fields of a result that do not need the run itself."""
-    counts = [run.nfev, run.njev, run.nlu, run.status, run.success, run.trusted, run.t.size]
-    events = [] if run.t_events is None else [t.size for t in run.t_events] + [t.sum() for t in run.t_events]
-    sums = [run.t.sum(), *run.y.sum(axis=1), *run.invariants.sum(axis=1), *run.target, *run.max_residual]
-    return np.array([*counts, *events, *sums, run.t[-1], *run.y[:, -1], *run.y.max(axis=1), len(run.message)])
-
-
-ADAPTIVE = {"method": EIPDOP853, "rtol": 1e-8}
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        STEPS | {"save_every": 40},
-        ADAPTIVE | {"t_eval": np.linspace(1.0, 7.0, 5)},
-        STEPS | {"compiled": False},
-        STEPS | {"events": EVENTS, "t_eval": np.linspace(1.0, 7.0, 5)},
-    ],
-    ids=["steps", "adaptive", "python", "events"],
-)
-def test_reduce_gets_the_results_of_single_runs(options):
-    run = ensemble(PROBLEM, SPAN, STARTS, reduce=seen, chunk=8, **options)
-    assert run.trajectories is None
-    for k, alone in pairs(run, **options):
-        np.testing.assert_array_equal(run.reduced[k], seen(alone))
-    assert np.isnan(run.reduced[FAILING]).all()
 
 
 def test_reduce_gets_derivatives_and_a_projected_start():

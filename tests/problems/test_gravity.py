@@ -349,19 +349,6 @@ def test_threads(code):
 # Frequencies of orbits, which bound the steps of multistep methods.
 
 
-def test_frequencies_of_orbits_and_of_a_moon():
-    """Two planets and a moon on known orbits."""
-    gm = np.array([1e-3, 1.0, 1e-9, 0.0])  # the first planet, the star, its moon, a test particle
-    q, v, e = np.zeros((4, 3)), np.zeros((4, 3)), 0.5
-    q[0], v[0] = (1, 0, 0), (0, np.sqrt(gm[0] + gm[1]), 0)
-    q[2], v[2] = q[0] + (0, 0, 0.01), v[0] + (np.sqrt((gm[0] + gm[2]) / 0.01), 0, 0)
-    q[3], v[3] = (0, 4 * (1 - e), 0), (np.sqrt((1 + e) / (4 * (1 - e))), 0, 0)
-    about, others = orbital_frequencies(gm, np.concatenate([q, v], axis=None))
-    expected = [np.sqrt(1.001), 0, np.sqrt(4**-3 * (1 - e) ** -1.5)]
-    assert about[[0, 1, 3]] == pytest.approx(expected, rel=1e-12)
-    assert others == pytest.approx(np.sqrt((gm[0] + gm[2]) / 0.01**3), rel=1e-9)
-
-
 @pytest.mark.parametrize("approaches", [True, False])
 def test_frequencies_within_a_run(approaches):
     """At the end of the run, or in the pericentre if that comes before: e = 0.9, from a known place on the orbit."""

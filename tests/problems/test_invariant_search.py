@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from eip_scipy import EIPRK4, check_gradient, find_invariants, hamiltonian, integrate
 from eip_scipy.problems import kepler as kepler_problem
-from eip_scipy_studies.hard_cases import hard_cases
 
 E = np.eye(6)
 
@@ -98,7 +97,6 @@ L, CIRCLE = "y0*y3 - y1*y2", "y0**2 + y1**2"
 # What is searched: function, start, options; and the names of all that is found.
 TABLE = {
     "Kepler": (kepler, PLANET, {}, [L]),
-    "Kepler, another seed": (kepler, PLANET, {"seed": 3, "degree": 4}, [L]),
     "Kepler, SI": (lambda t, y: kepler(t, y, 1.327e20), [1.496e11, 0.0, 0.0, 2.98e4], {}, [L]),
     "Kepler, terms": (kepler, PLANET, {"degree": 3, "terms": ELLIPSE},
                       [L, "y2**2 + y3**2 - 2*inverse_radius(y)", "y0*y3**2 - y1*y2*y3 - cosine(y)"]),
@@ -112,8 +110,6 @@ TABLE = {
     "equal oscillators": (forced(lambda t, q: -q), [1.0, 0.0, 0.0, 0.5], {}, [L, "y0**2 + y2**2", "y1**2 + y3**2"]),
     "coupled quartic": (forced(lambda t, q: -(q**3) - 2 * q * q[::-1] ** 2), [1.0, 0.5, 0.0, 0.0], {"degree": 4},
                         ["2*y2**2 + 2*y3**2 + y0**4 + 4*y0**2*y1**2 + y1**4"]),
-    "separate quartic": (forced(lambda t, q: -np.array([1, 3]) * q**3), [0.1, 0.2, 0.3, 0.4], {"degree": 4},
-                         ["2*y2**2 + y0**4", "2*y3**2 + 3*y1**4"]),
     "Henon and Heiles, Sawada and Kotera's": (henon_heiles(1, 1), [0.1, 0.2, 0.3, 0.1], {"degree": 3},
         ["3*y0*y1 + 3*y2*y3 + y0**3 + 3*y0*y1**2", "3*y0**2 + 3*y1**2 + 3*y2**2 + 3*y3**2 + 6*y0**2*y1 + 2*y1**3"]),
     "Henon and Heiles, Korteweg and de Vries'": (henon_heiles(4, 6), [0.1, 0.2, 0.3, 0.1], {"degree": 4},
@@ -123,8 +119,6 @@ TABLE = {
                                                      2 * (y[:3] ** 2 - np.roll(y[:3], 1) ** 2)),
         SPINNING, {"degree": 3}, ["y3 + y4 + y5", "2*y0**2 + 2*y1**2 + 2*y2**2 + y3**2 + y4**2 + y5**2", "y0*y1*y2",
         "3*y0**2*y3 + 3*y0**2*y4 + 3*y1**2*y4 + 3*y1**2*y5 + 3*y2**2*y3 + 3*y2**2*y5 + y3**3 + y4**3 + y5**3"]),
-    "Maxwell and Bloch": (lambda t, y: np.array([y[1], y[0] * y[2], -y[0] * y[1]]), [0.3, 0.5, 0.2], {},
-                          ["2*y2 + y0**2", "y1**2 + y2**2"]),
     "Nose and Hoover": (lambda t, y: np.array([y[1], -y[0] - y[2] * y[1], y[1] ** 2 - 1, y[2] * y[3]]),
         [1.0, 0.2, 0.1, 1.0], {"terms": {"log(s)": log(3, 4)}}, ["y0**2 + y1**2 + y2**2 + 2*log(s)"]),
     "Volterra": (volterra(2 / 3, 4 / 3, 1, 1), [1.0, 0.5], {"terms": LOGS}, ["3*y0 + 4*y1 - 3*log(y0) - 2*log(y1)"]),
@@ -153,7 +147,6 @@ TABLE = {
     "infinite term, kept for y1 < 5": (lambda t, y: np.array([1.0 + (y[1] > 5.0), y[1]]), [1.0, 0.0],
                                        {"terms": {"log(y1)": log(1)}}, []),
     "driven": (forced(lambda t, q: -q + np.sin(2 * t)), [0.0, 0.0], {}, []),
-    "driven stiffness": (forced(lambda t, q: -q * t), [1.0, 0.0], {}, []),
     "driven late": (forced(lambda t, q: -q + (t > 30.0)), [1.0, 0.0], {}, []),
     "driven very late": (lambda t, y: np.array([y[1], y[0] ** 2]) * (t > 1e6), [1.0, 1.0], {}, []),
     "driven weakly": (lambda t, y: 1e-12 * np.array([y[1], -y[0] + t]) * t, [1.0, 0.0], {}, []),
@@ -171,53 +164,6 @@ TABLE = {
 def test_known_systems(case):
     fun, y0, options, names = TABLE[case]
     assert [item.name for item in find_invariants(fun, y0, **options)] == names
-
-
-def spans(found, gradients, points):
-    """Return whether the gradients of what was found span those known, and no more."""
-    for y in points:
-        a, b = np.array([item.grad(0.0, y) for item in found]), np.array([grad(y) for grad in gradients])
-        a, b = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (a, b))
-        if {np.linalg.matrix_rank(rows, tol=1e-8) for rows in (a, b, np.vstack([a, b]))} != {len(gradients)}:
-            return False
-    return len(found) == len(gradients)
-
-
-def quartic(y):
-    """The gradient of Kovalevskaya's ((m1^2 - m2^2) / 4 - g1)^2 + (m1 m2 / 2 - g2)^2."""
-    a, b = (y[0] ** 2 - y[1] ** 2) / 4 - y[3], y[0] * y[1] / 2 - y[4]
-    return 2 * a * ((y[0] * E[0] - y[1] * E[1]) / 2 - E[3]) + 2 * b * ((y[1] * E[0] + y[0] * E[1]) / 2 - E[4])
-
-
-@pytest.mark.parametrize(
-    ("inertia", "centre", "more"), [((1.0, 2.0, 3.0), (0.3, 0.2, 1.0), []), ((2.0, 2.0, 1.0), (1.0, 0, 0), [quartic])]
-)
-def test_tops(inertia, centre, more):
-    known = [
-        lambda y: np.concatenate([y[:3] / inertia, centre]),
-        lambda y: np.concatenate([y[3:], y[:3]]),
-        lambda y: np.concatenate([np.zeros(3), y[3:]]),
-        *more,
-    ]
-    found = find_invariants(top(np.array(inertia), centre), SPINNING, degree=4 if more else 2)
-    assert spans(found, known, np.random.default_rng(0).normal(size=(5, 6)))
-
-
-HOW_MANY = {  # of a hard case's invariants are polynomials of degree 2
-    "kepler_e0999": 1, "kepler_si": 1, "arenstorf": 0, "euler_top_tennis": 2, "euler_detest": 2, "quaternion": 1,
-    "sir": 1, "volterra_lattice": 2, "vortices": 3, "schwarzschild": 2, "brockett": 2, "double_pendulum": 0,
-    "tokamak": 1,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", HOW_MANY)
-def test_hard_cases(name):
-    ((case),) = hard_cases([name])
-    found = find_invariants(case.problem.fun, case.problem.y0)
-    f = case.problem.fun(0.0, case.problem.y0)
-    terms = [item.grad(0.0, case.problem.y0) * f for item in found]
-    assert len(found) == HOW_MANY[name]
-    assert all(abs(row.sum()) <= 1e-12 * np.abs(row).sum() for row in terms)
 
 
 # Properties of random systems y' = S grad H(y), with an antisymmetric matrix S, and H a polynomial.

@@ -7,8 +7,7 @@ from numba import njit
 from scipy.special import ellipe, ellipk
 from sympy.physics import mechanics as me
 
-from eip_scipy import EIPDOP853, ensemble, integrate
-from eip_scipy.chaos import lyapunov_spectrum, megno
+from eip_scipy import EIPDOP853, integrate
 from eip_scipy.problems import mechanics, mechanism
 
 G = 9.81
@@ -160,33 +159,3 @@ def test_derivatives_by_parameters_of_a_model():
     pull = 1.5 * np.sin(1.0)
     expected = [[0, 0], [-period / 6 * pull, period / 4 * pull]]
     np.testing.assert_allclose(run.sensitivities[-1], expected, atol=1e-9)
-
-
-@njit
-def equation(t, y):
-    return np.array([y[1], -G * np.sin(y[0])])
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.slow_without_jit
-def test_tangent_maps_are_those_of_the_equation():
-    problem = system("1, free")
-    both = [(problem, ()), (equation, ([1.0, 0.0],))]
-    kept = {"invariants": problem.invariants}
-    one, two = (lyapunov_spectrum(fun, (0, 20), *y0, **OPTIONS, **kept).exponents for fun, y0 in both)
-    np.testing.assert_allclose(one, two, rtol=1e-6)
-    one, two = (megno(fun, (0, 20), *y0, **OPTIONS, **kept).megno for fun, y0 in both)
-    assert one == pytest.approx(two, rel=1e-6)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_members_have_the_columns_of_their_runs_and_columns_change_no_state():
-    problem = system("2, circle")
-    starts = np.array([[1.0, 0, 0, 0], [0.6, -0.8, 0, 0]])
-    members = ensemble(problem, problem.t_span, starts, variations="state", **OPTIONS)
-    for y0, columns in zip(starts, members.variations, strict=True):
-        run, bare = (integrate(problem, y0=y0, variations=asked, **OPTIONS) for asked in ("state", None))
-        np.testing.assert_array_equal(columns, run.stm[-1])
-        np.testing.assert_array_equal(run.y, bare.y)

@@ -14,7 +14,6 @@ from eip_scipy import (
     Balance,
     EIPRadau,
     Invariant,
-    ProjectionWarning,
     ensemble,
     integrate,
     load,
@@ -406,50 +405,6 @@ def test_known_motions(make, tolerance, end, error):
     assert found.trusted
     options = error if isinstance(error, dict) else {"rtol": 0, "atol": error}
     np.testing.assert_allclose(found.y[: len(expected), -1], expected, **options)
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "count"), [(1, 7), (5, 7), (20, 7), (5, 37)])
-def test_the_n_four_bar_mechanism_passes_its_singular_positions_at_any_tolerance(n, count):
-    problem = examples.n_four_bar(n)
-    end = problem.reference(10.0)[: 2 * n + 2]
-    bounds = (6000, 1e3), (3000, 30) if count == 7 else (6000, 1e3)
-    for tolerance in np.logspace(-4, -10, count):
-        for invariants, (calls, error) in zip((problem.constraints, problem.invariants), bounds, strict=True):
-            found = run(problem, tolerance, invariants=invariants)
-            assert found.trusted
-            assert found.nfev < calls
-            assert np.abs(found.y[: 2 * n + 2, -1] - end).max() < error * tolerance
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-8])
-def test_a_leak_at_singular_positions_is_reported(tolerance):
-    right = examples.n_four_bar(1)
-
-    def forces(t, q, u):
-        drag = 0.1 * np.exp(-((q[1] / 0.02) ** 2))  # where all rods are horizontal
-        return np.array([0, -G - drag * u[1], 0, -G - drag * u[3]])
-
-    def lengths(t, q):
-        left, right = q[0] ** 2 + q[1] ** 2 - 1, (q[2] - 1) ** 2 + q[3] ** 2 - 1
-        return np.array([left, right, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1]) / 2
-
-    def gamma(t, q, u):
-        last = (u[2] - u[0]) ** 2 + (u[3] - u[1]) ** 2
-        return np.array([u[0] ** 2 + u[1] ** 2, u[2] ** 2 + u[3] ** 2, last])
-
-    leaky = mechanism(
-        np.kron(np.eye(2) / 3 + np.array([[2, 1], [1, 2]]) / 6, np.eye(2)), njit(forces), njit(lengths),
-        q0=right.y0[:4], u0=right.y0[4:], t_span=(0, 10), gamma=njit(gamma),
-        potential_energy=njit(lambda t, q: G * (q[1] + q[3])),
-    )  # fmt: skip
-    assert not leaky.energy.is_balance  # the drag is not seen near the start
-    with pytest.warns(ProjectionWarning, match="energy"):
-        found = run(leaky, tolerance)
-    assert not found.trusted
 
 
 @pytest.mark.nightly

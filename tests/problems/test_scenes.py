@@ -205,21 +205,6 @@ def test_fictitious_time_with_invariants_of_a_user():
     assert run.max_residual.max() < 1e-13
 
 
-@pytest.mark.slow
-@pytest.mark.needs_jit
-def test_fixed_steps_in_fictitious_time_beat_fixed_steps():
-    problem = kepler(0.99, 0.0, t_end=20.0)
-    run = integrate(time_transformed(problem, 1e6, centre_time), method=EIPDOP853, h=0.1, events=reaches(20.0))
-    assert run.compiled
-    assert run.status == 1
-    assert run.y[-1, -1] == 20.0 or abs(run.y[-1, -1] - 20.0) < 1e-13
-    error = np.abs(run.y[:2, -1] - problem.reference(20.0)[:2]).max()
-    # The steps are far too long at the pericentre, which is not reported here.
-    fixed = integrate(problem, method=EIPDOP853, h=20.0 / run.nfev * 12, check=False)
-    assert error < 1e-9
-    assert not np.abs(fixed.y[:2, -1] - problem.reference(20.0)[:2]).max() < 1e-2
-
-
 def test_a_problem_without_compiled_equations_is_refused():
     with pytest.raises(ValueError, match="has no compiled right-hand side"):
         time_transformed(replace(harmonic(), rhs=None), 1.0)

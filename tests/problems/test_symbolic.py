@@ -200,16 +200,6 @@ def test_parameters_by_name_in_runs(orbit):
             integrate(orbit, (0, 1), y0, params=params, method=EIPRK4, h=0.1)
 
 
-def test_a_start_and_an_interval_are_for_the_run():
-    problem = hamiltonian(HENON_HEILES, name="Henon-Heiles")
-    for call, name in ((integrate, "y0"), (ensemble, "y0s")):
-        with pytest.raises(TypeError, match=f"{name} is missing"):
-            call(problem, (0, 1), method=EIPRK4, h=0.1)
-    start = dataclasses.replace(problem, y0=np.array([0.0, 0.1, 0.5, 0.0]), t_span=(0.0, 1.0))
-    assert integrate(start, method=EIPRK4, h=0.1).success
-    assert repr(start).startswith("Henon-Heiles: y = (x, y, px, py), pairs x with px, y with py\n")
-
-
 # Equations, energies, gradients.
 
 
@@ -305,14 +295,6 @@ def test_h_that_depends_on_time():
     assert run.trusted
 
 
-def test_invariants_of_time():
-    """x - v t of a free particle."""
-    problem = equations(["v", "0"], "x v", invariants={"start": "x - v*t"})
-    run = integrate(problem, (1, 3), [0.5, 2.0], method=EIPRK4, h=0.1)
-    assert run.y[:, -1] == pytest.approx([4.5, 2.0])
-    assert run.max_residual[0] < 1e-14
-
-
 # How invariants are known. The last: also next to q = 2 and q = -2.
 
 SWITCHED = {"H^30": "(p**2/2 + max(abs(q) - 2, 0)**2/2 + sin(p)**2 + cos(p)**2)**30"}
@@ -369,14 +351,12 @@ WRONG = {
         ((sympy.Symbol("a b"), [X], [P]), ValueError, "not a name"),
         *(((wrong, [X], [P]), TypeError, "expected an expression") for wrong in ([X], True, 1j, None)),
         (("px**2 + k*x**2",), ValueError, r"not clear what k is: .* goes with it \(pairs found: x with px\)"),
-        (("p**2/(2*m) + k*q**2/2",), ValueError, r"not clear what k and m are: .*{'k': 1.0, 'm': 1.0}\. "),
         (("p**2 + a*b",), ValueError, r"a and b and p are: .* goes with them \(pairs found: none\).*'p': 1.0}"),
         (("3",), ValueError, r"H contains neither coordinates nor momenta\. Names are paired as x with px"),
         (("p**2", "q"), TypeError, "give both q and p, or neither"),
         (("p**2", "q r", "p"), ValueError, "2 coordinates"),
         (("p**2", "q", "q"), ValueError, "occurs twice"),
         (("p**2", "q r", "p a-b"), ValueError, "'a-b' is not a name"),
-        (("p**2", "lambda", "p"), ValueError, "'lambda' is not a name"),
         (("p**2", "t", "p"), ValueError, "t is the time"),
         (("p**2", 3, "p"), TypeError, "expected names"),
         (("p**2", [3], "p"), TypeError, "expected names"),
@@ -392,13 +372,10 @@ WRONG = {
         (("p**2/2 + sign(q - 1)",), ValueError, "function that jumps where q - 1 is 0"),
         (rigid([[0, 1], [-1, 0]]), ValueError, r"shape \(3, 3\)"),
         (rigid([[0, 1, 0], [1, 0, 0], [0, 0, 0]]), ValueError, "must be antisymmetric"),
-        (rigid([[1, 0, 0], [0, 0, 0], [0, 0, 0]]), ValueError, "must be antisymmetric"),
         (rigid(q=None), TypeError, "names of the whole state as q"),
-        (rigid(p="a b c"), TypeError, "names of the whole state as q"),
         (("(px**2 + py**2)/2 + x**2 + 2*y**2", {"invariants": MOMENTUM}), ValueError,
          r"'L' is not an invariant of these equations: its rate is .*\. At x="),
         (kept(f"({HENON_HEILES})**13 + 1e-9*x"), ValueError, "'I' is not an invariant"),
-        (kept("z"), ValueError, "contains z, which is neither a component of the state nor a parameter"),
         (kept("3"), ValueError, "does not depend on x, y, px, py"),
         ((HENON_HEILES, {"invariants": {"H": "x"}}), ValueError, "H is already the name of an invariant"),
         (kept("sqrt(-2 - x**2)"), ValueError, "not finite and real at any point"),
@@ -412,7 +389,6 @@ WRONG = {
         ((["y", "-x"],), TypeError, "y is missing"),
         ((["y"], "x y"), ValueError, "1 derivatives for the 2 components"),
         (({"x": "y", "y": "-x"}, "x z"), ValueError, "f has derivatives of x, y, but y is x, z"),
-        (({"x": "y", "y": "-z"},), ValueError, "contains z, which is neither"),
         ((FRICTIONLESS, {"invariants": {"E": "y**2/2 + 3*abs(x)*cbrt(x)/4"}}), ValueError, "not an invariant"),
     ],
     lambda *args, **options: hamiltonian(*args, **options).second_order(): [

@@ -187,21 +187,6 @@ def test_forces(n):
             assert_variational(problem, problem.y0, rng, (), 5)
 
 
-@pytest.mark.parametrize("force", ["1pn", "eih", "gr-potential", "j2", "j4", "moon-quadrupole", "drag"])
-def test_what_a_force_adds(force):
-    """Compare the parts of each force alone, so that Newton's larger part hides nothing."""
-    rng = np.random.default_rng(5)
-    given = bodies(rng, 5)
-    problem = nbody(*given, t_span=(0.0, 1.0), forces=force, constants=replace(CONSTANTS, moon_body=2))
-    plain, y = nbody(*given, t_span=(0.0, 1.0)), problem.y0
-    for direction in rng.standard_normal((6, y.size)):
-        Y = np.append(y, direction)
-        found = in_place(problem.variational(()), 0.0, Y, problem.params)
-        found -= in_place(plain.variational(()), 0.0, Y, plain.params)
-        expected = difference(lambda y: problem.fun(0.0, y) - plain.fun(0.0, y), y, direction)
-        np.testing.assert_allclose(found[y.size :], expected, rtol=0, atol=RTOL * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("relativity", RELATIVITY)
 @pytest.mark.parametrize("others", OTHERS)
 @pytest.mark.parametrize("n", [2, 5])

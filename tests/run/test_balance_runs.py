@@ -8,6 +8,9 @@ import pytest
 import scipy.integrate
 from c_compiler import low_level, shared_library
 from numba import njit
+from systems import BALANCES, QUARTIC_PARAMS, QUARTIC_START, swinging
+from systems import quartic_energy as energy
+from systems import quartic_rate as rate
 
 from eip_scipy import (
     EIPDOP853,
@@ -17,69 +20,21 @@ from eip_scipy import (
     Balance,
     Invariant,
     ProjectionWarning,
-    ensemble,
     integrate,
 )
 from eip_scipy.checkpoint import CheckpointError
 
-# A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
-PARAMS = np.array([1e-3, 0.3])
-START = np.array([1.0, 0.3])
 RUNS = [
     {"method": EIPDOP853, "h": 0.25},
     {"method": EIPRK4, "h": 0.1, "every": 3},
     {"method": EIPRK45, "rtol": 1e-8, "atol": 1e-10},
     {"method": EIPGJ12, "h": 0.025},
 ]
+PARAMS, START, BALANCE = QUARTIC_PARAMS, QUARTIC_START, BALANCES["rate"]
 
 
-@njit
-def swinging(t, y, p):
-    return np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3])
-
-
-@njit
-def energy(t, y, p):
-    return 0.5 * y[1] ** 2 + 0.5 * (1 + p[0] * np.sin(p[1] * t)) * y[0] ** 2 + 0.25 * y[0] ** 4
-
-
-@njit
-def gradient(t, y, p):
-    return np.array([(1 + p[0] * np.sin(p[1] * t)) * y[0] + y[0] ** 3, y[1]])
-
-
-@njit
-def rate(t, y, p):
-    return 0.5 * p[0] * p[1] * np.cos(p[1] * t) * y[0] ** 2
-
-
-@njit
-def rate_by_f(t, y, f, p):
-    return y[1] * f[1] + (1 + p[0] * np.sin(p[1] * t)) * y[0] * f[0] + y[0] ** 3 * f[0] + rate(t, y, p)
-
-
-@njit
-def gradient_by_f(t, y, f, p):
-    return np.array([-f[1], f[0]])
-
-
-@njit
-def twice(t, y, p):
-    return np.array([energy(t, y, p), 2 * energy(t, y, p)])
-
-
-BALANCES = {
-    "rate": Balance(energy, rate, gradient, name="H"),
-    "f": Balance(energy, rate_by_f, gradient_by_f, name="H", uses_f=True),
-    "gradient": Balance(energy, grad=gradient, name="H"),
-    "values": Balance(energy, name="H"),
-    "pair": Balance(twice, name="H"),
-}
-BALANCE = BALANCES["rate"]
-
-
-def run(balance=BALANCE, end=20.0, **options):
-    return integrate(swinging, (0, end), START, params=PARAMS, invariants=balance, **options)
+def run(end=20.0, **options):
+    return integrate(swinging, (0, end), START, **{"params": PARAMS, "invariants": BALANCE, **options})
 
 
 def exact(end):
@@ -89,22 +44,7 @@ def exact(end):
     return scipy.integrate.solve_ivp(fun, (0, end), START, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("options", RUNS)
-def test_compiled_runs_have_the_bits_of_interpreted_ones(options):
-    times, end = np.linspace(0, 20, 33), exact(20.0)
-    loose = 1e-7 if options["method"] is EIPRK4 else 2e-11
-    for name, balance in BALANCES.items():
-        compiled, interpreted = (run(balance, compiled=c, t_eval=times, **options) for c in (True, False))
-        assert compiled.compiled
-        np.testing.assert_array_equal(compiled.y, interpreted.y)
-        np.testing.assert_array_equal(compiled.diagnostics.slowness, interpreted.diagnostics.slowness)
-        assert compiled.trusted
-        assert np.abs(compiled.invariants[0, -1] - energy(20.0, end, PARAMS)) < loose
-        assert compiled.calls.get("rate of H") == ("jitted" if name in ("rate", "f") else None)
-
-
-def test_args_reach_the_rate():
+def test_rates_in_all_ways():
     """The arguments of the balance come first, then those of the run."""
 
     def swing(t, y, a, w):
@@ -113,9 +53,12 @@ def test_args_reach_the_rate():
     of_run = Balance(lambda t, y, *p: energy(t, y, PARAMS), lambda t, y, a, w: rate(t, y, np.array([a, w])), name="H")
     own = Balance(lambda t, y, k, *p: energy(t, y, PARAMS), lambda t, y, k, *p: k / 3 * rate(t, y, PARAMS), args=(3,))
     expected = run(method=EIPDOP853, h=0.25).y[:, -1]
-    for balance in (of_run, own):
-        found = integrate(swing, (0, 20), START, args=tuple(PARAMS), method=EIPDOP853, h=0.25, invariants=balance)
+    ways = [(swing, balance, {"args": tuple(PARAMS)}) for balance in (of_run, own)]
+    ways += [(swinging, balance, {"params": PARAMS}) for balance in BALANCES.values()]
+    for fun, balance, given in ways:
+        found = integrate(fun, (0, 20), START, method=EIPDOP853, h=0.25, invariants=balance, **given)
         assert np.abs(found.y[:, -1] - expected).max() < 1e-12
+        assert found.trusted
 
 
 SOURCE = """
@@ -163,27 +106,11 @@ def test_c_functions(library):
                   invariants=Balance(library.energy, library.rate, name="H"))  # fmt: skip
 
 
-@pytest.mark.usefixtures("fine")
-@pytest.mark.parametrize("options", RUNS)
-def test_a_resumed_run_has_the_same_bits(tmp_path, stopped, options):
-    balance, file = BALANCES["gradient" if "every" in options else "rate"], tmp_path / "run.npz"
-    seen = []
-    whole = run(balance, save_every=4, callback=lambda t, y, residuals: seen.append(residuals), **options)
-    assert np.isnan(seen).all()  # the value that is kept changes
-    with stopped(9):
-        run(balance, save_every=4, checkpoint=file, **options)
-    found = run(balance, save_every=4, checkpoint=file, resume=True, **options)
-    assert "resumed at step" in found.message
-    assert "step 0" not in found.message
-    np.testing.assert_array_equal(found.y, whole.y)
-    np.testing.assert_array_equal(found.diagnostics.slowness, whole.diagnostics.slowness)
-
-
 def test_a_checkpoint_knows_which_are_balances(tmp_path):
     options = {"method": EIPRK4, "h": 0.1, "end": 5.0, "checkpoint": tmp_path / "run.npz", "check": False}
     run(**options)
     with pytest.raises(CheckpointError, match="balances"):
-        run(Invariant(energy, gradient, name="H"), resume=True, **options)
+        run(invariants=Invariant(energy, name="H"), resume=True, **options)
 
 
 @pytest.mark.parametrize("options", RUNS)
@@ -233,25 +160,6 @@ def test_a_run_in_two_parts_is_as_slow_as_in_one(options):
     assert whole > 0.1
     assert halves == pytest.approx(whole, rel=0.15)
     assert until(200.0).diagnostics.slowness[0] < 0.05
-
-
-@pytest.mark.parametrize("options", RUNS)
-def test_members_of_ensembles_are_single_runs(options):
-    starts = np.array([[1.0, 0.3], [0.8, 0.0], [1.2, -0.1]])
-    given = {"params": PARAMS, "invariants": BALANCE, "t_eval": [3.3, 20.0], **options}
-    members = ensemble(swinging, (0, 20), starts, **given)
-    for k, start in enumerate(starts):
-        single = integrate(swinging, (0, 20), start, **given)
-        np.testing.assert_array_equal(members.trajectories[k], single.y)
-        np.testing.assert_array_equal(members.max_residual[k], single.max_residual)
-    assert members.trusted.all()
-    assert np.isnan(members.target).all()
-    assert "the runs have balances" in str(members)
-
-
-def stiffness(t, q, dq, out):
-    r2 = q @ q
-    out[:] = (3 * q * (q @ dq) / r2 - dq) / r2**1.5
 
 
 YEAR = 365.25 * 86400.0

@@ -11,23 +11,17 @@ from eip_scipy.core.invariant_set import LARGE, InvariantSet
 
 # In C, and in Python for complex steps.
 FUNCTIONS = {
-    "kinetic": ("0.5*(y[2]*y[2] + y[3]*y[3])", lambda y: 0.5 * (y[2] ** 2 + y[3] ** 2)),
     "kepler": (
         "0.5*(y[2]*y[2] + y[3]*y[3]) - 1/sqrt(y[0]*y[0] + y[1]*y[1])",
         lambda y: 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2),
     ),
     "momentum": ("y[0]*y[3] - y[1]*y[2]", lambda y: y[0] * y[3] - y[1] * y[2]),
     "pendulum": ("0.5*y[1]*y[1] - cos(3*y[0])", lambda y: 0.5 * y[1] ** 2 - np.cos(3 * y[0])),
-    "henon_heiles": ("y[0]*y[0]*y[1] - y[1]*y[1]*y[1]/3", lambda y: y[0] ** 2 * y[1] - y[1] ** 3 / 3),
     "lotka_volterra": (
         "y[0] - log(y[0]) + y[1] - 2*log(y[1])",
         lambda y: y[0] - np.log(y[0]) + y[1] - 2 * np.log(y[1]),
     ),
-    "toda": ("exp(y[0] - y[1]) + exp(y[1] - y[2])", lambda y: np.exp(y[0] - y[1]) + np.exp(y[1] - y[2])),
     "lennard_jones": ("pow(y[0], -12) - pow(y[0], -6)", lambda y: y[0] ** -12 - y[0] ** -6),
-    "root": ("sqrt(1 + y[0]*y[0] + y[1]*y[1])", lambda y: np.sqrt(1 + y[0] ** 2 + y[1] ** 2)),
-    "hyperbolic": ("tanh(y[0]*y[2])", lambda y: np.tanh(y[0] * y[2])),
-    "quotient": ("y[0]*y[1]/(1 + y[2]*y[2])", lambda y: y[0] * y[1] / (1 + y[2] ** 2)),
     "near": ("1/sqrt((y[0] - 1)*(y[0] - 1) + 1e-8)", lambda y: 1 / np.sqrt((y[0] - 1) ** 2 + 1e-8)),
     "moon": ("y[2]*y[3] - 1e-6/fabs(y[0] - y[1])", lambda y: y[2] * y[3] - 1e-6 / (y[0] - y[1])),
 }

@@ -157,9 +157,11 @@ def test_directions_and_the_order_in_time_within_one_step():
         events=[reaching(0.995), reaching(0.99, terminal=3)],
         invariants=ENERGY,
         save_every=1,
+        dense_output=True,
     )
     assert ended.status == 1
-    assert ended.t[-1] == ended.t_events[1][-1]
+    assert ended.t[-1] == ended.t_events[1][-1] == ended.sol.ts[-1]
+    np.testing.assert_array_equal(ended.sol(ended.t[-1]), ended.y_events[1][-1])
     assert ended.t_events[1].size == 3
     np.testing.assert_allclose(ended.t_events[1], passages(0.99)[:3], rtol=0, atol=1e-5)
     # Later events of the step that ends the run do not count.
@@ -223,52 +225,31 @@ def test_counts_go_on_from_a_checkpoint_of_a_continued_run(tmp_path):
     np.testing.assert_allclose(run.t_events[0], times[:5], rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853, EIPRKN12])
-def test_a_run_goes_on_from_event_to_event(method):
-    """The state at an event is off zero by rounding, on either side; each zero is found once."""
-
-    def zero(t, y):
-        return y[0]
-
-    zero.terminal = True
-    step = {"h": 0.05} if method is EIPRK4 else {"rtol": 1e-9, "atol": 1e-9}
-    for omega, end in ((0.5, 60), (1.0, -60), (2.5, 60), (3.0, -60)):
-        run = integrate(
-            lambda t, y, w=omega: [y[1], -(w**2) * y[0]], (0, end), [1.0, 0.3 * np.sign(end)], method=method,
-            events=zero, **step
-        )  # fmt: skip
-        for _ in range(8):
-            run = run.continue_to(end)
-        first = (np.pi - np.arctan(omega / 0.3)) / omega
-        expected = np.sign(end) * (first + np.arange(9) * np.pi / omega)
-        np.testing.assert_allclose(run.t_events[0], expected, rtol=2e-4 if method is EIPRK4 else 1e-7)
-        assert run.t[-1] == run.t_events[0][-1]
-
-
-def from_event_to_event(start, method, events, end, **options):
-    """Return the times at which runs end, each of which begins where the last one has ended: three by `start`."""
-    t, y, times = 0.0, START, []
+def from_event_to_event(way, end, **options):
+    """Return the times at which runs end, each of which begins where the last one has ended: three."""
+    t, y, times, run = 0.0, START, [], None
     for _ in range(3):
-        if start is ensemble:
-            run = ensemble(oscillator, (t, end), [y], method=method, events=events, executor=1, **options)
+        if way is ensemble:
+            run = ensemble(oscillator, (t, end), [y], executor=1, **options)
             t, y = run.t[0], run.y[0]
         else:
-            run = start(oscillator, (t, end), y, method=method, events=events, **options)
+            solve = integrate if way is None else way
+            run = run.continue_to(end) if run and way is None else solve(oscillator, (t, end), y, **options)
             t, y = run.t[-1], run.y[:, -1]
         assert np.all(run.status == 1)
         times.append(t)
     return np.array(times)
 
 
-@pytest.mark.parametrize("start", [integrate, ensemble, solve_ivp], ids=lambda start: start.__name__)
+@pytest.mark.parametrize("way", [integrate, ensemble, solve_ivp, None], ids=["integrate", "ensemble", "scipy", "on"])
 @pytest.mark.parametrize("method", [EIPRK4, EIPRK45, EIPDOP853, EIPRKN12, EIPGJ12, EIPRadau])
-def test_a_run_begins_at_the_event_that_ended_another(start, method):
-    """The state is exact, or off by rounding to either side; see `test_a_run_goes_on_from_event_to_event`."""
+def test_a_run_goes_on_from_event_to_event(way, method):
+    """The state at an event is exact, or off by rounding to either side; each zero is found once."""
     step = {"h": 0.05} if method in (EIPRK4, EIPGJ12) else {"rtol": 1e-7, "atol": 1e-7}
     for level, end in ((0.0, 20), (0.3, -20), (0.5, 20)):
-        times = from_event_to_event(start, method, reaching(level, terminal=True), end, invariants=ENERGY, **step)
-        expected = passages(level, 20) if end > 0 else -(np.array(passages(level, 20 + 2 * PHASE)) + 2 * PHASE)
-        expected = expected[expected < 0] if end < 0 else expected
+        options = {"method": method, "events": reaching(level, terminal=True), "invariants": ENERGY, **step}
+        times = from_event_to_event(way, end, **options)
+        expected = passages(level, 20) if end > 0 else -(passages(level, 20 + 2 * PHASE) + 2 * PHASE)
         assert (np.abs(np.diff(times)) > 0.1).all()
         np.testing.assert_allclose(np.diff(times), np.diff(expected)[:2], rtol=0, atol=1e-3)
 
@@ -309,7 +290,9 @@ def test_a_run_that_starts_beyond_a_limit_ends_there(direction, native):
     fun = njit(oscillator) if native else oscillator
     one, other = np.array([0.6, 0.1]), np.array([0.4, 0.0])
     for t_span in ((0, 9), (9, 0)):
-        for run in (integrate(fun, t_span, one, **options), solve_ivp(fun, t_span, one, **options)):
+        for solve in (integrate, solve_ivp):
+            run = solve(fun, t_span, one, dense_output=True, **options)
+            np.testing.assert_array_equal(run.sol(t_span[0]), one)
             assert (run.status, run.t[-1], run.t_events[0].tolist()) == (1, t_span[0], [t_span[0]])
             np.testing.assert_array_equal(run.y[:, -1], one)
         many = ensemble(fun, t_span, [one, other], executor=1, **options)

@@ -1,6 +1,6 @@
 """Gradients that are made of the components of f: where they hold, where they do not, and what happens after a change.
 
-40 energies of chains, clusters and other systems are given without a gradient. Runs with gradients by hand, or by dual
+Energies of chains and other systems are given without a gradient. Runs with gradients by hand, or by dual
 numbers, tell what is right.
 """
 
@@ -8,10 +8,10 @@ import copy
 
 import numpy as np
 import pytest
+from systems import lotka_volterra
 
-from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant, check_gradient, ensemble, integrate, solve_ivp
+from eip_scipy import EIPDOP853, EIPRK4, EIPRKN12, Invariant, check_gradient, integrate, solve_ivp
 
-njit = pytest.importorskip("numba").njit
 N = 13  # coordinates of a chain: 26 components, more than two passes of dual numbers
 RNG = np.random.default_rng(4)
 MASSES = RNG.uniform(0.5, 3.0, N)
@@ -149,17 +149,6 @@ def rotating_frame():
     return fun, lambda t, y: (y[2] ** 2 + y[3] ** 2 - y[0] ** 2 - y[1] ** 2) / 2 - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
 
 
-def rod():
-    """A pendulum by cartesian coordinates: the tension of the rod is not in the gradient of the energy."""
-
-    def fun(t, y):
-        x, z, v, w = y
-        tension = (v * v + w * w - z) / (x * x + z * z)
-        return np.array([v, w, -tension * x, -tension * z - 1.0])
-
-    return fun, lambda t, y: (y[2] ** 2 + y[3] ** 2) / 2 + y[1]
-
-
 def double_pendulum():
     """Velocities with a mass matrix that depends on the angles."""
 
@@ -175,14 +164,6 @@ def double_pendulum():
         return v * v + w * w / 2 + v * w * np.cos(a - b) - 2 * np.cos(a) - np.cos(b)
 
     return fun, energy
-
-
-def relativistic_velocity():
-    def fun(t, y):
-        q, v = y
-        return np.array([v, -q * (1 - v * v) ** 1.5])
-
-    return fun, lambda t, y: 1 / np.sqrt(1 - y[1] ** 2) + y[0] ** 2 / 2
 
 
 def relativistic_momentum():
@@ -211,20 +192,9 @@ def vortices():
     return fun, energy
 
 
-def pairs_in_turn():
+def in_turn(t, y):
     """(q1, p1, q2, p2): the halves of the state are not coordinates and momenta."""
-    return (
-        lambda t, y: np.array([y[1], -y[0] - y[0] * y[2] ** 2, y[3], -y[2] - y[2] * y[0] ** 2]),
-        lambda t, y: (y @ y + y[0] ** 2 * y[2] ** 2) / 2,
-    )
-
-
-def predators():
-    """Lotka and Volterra: a Poisson system whose structure depends on the state."""
-    return (
-        lambda t, y: np.array([y[0] * (1 - y[1]), y[1] * (y[0] - 1)]),
-        lambda t, y: y[0] - np.log(y[0]) + y[1] - np.log(y[1]),
-    )
+    return np.array([y[1], -y[0] - y[0] * y[2] ** 2, y[3], -y[2] - y[2] * y[0] ** 2])
 
 
 def energy_squared():
@@ -235,13 +205,11 @@ def energy_squared():
 OTHERS = [
     (magnetic_momenta, [0.5, 0.1, -0.2, 0.6], True),
     (rotating_frame, [0.5, 0.1, 0.0, 1.1], False),
-    (rod, [0.6, -0.8, 0.4, 0.3], False),
     (double_pendulum, [0.5, -0.3, 0.2, 0.1], False),
-    (relativistic_velocity, [0.3, 0.5], False),
     (relativistic_momentum, [0.3, 0.5], True),
     (vortices, [0.0, 1.0, 0.3, 0.2, -0.4, 0.9], True),
-    (pairs_in_turn, [0.3, 0.5, -0.2, 0.1], False),
-    (predators, [0.5, 0.8], False),
+    (lambda: (in_turn, lambda t, y: (y @ y + y[0] ** 2 * y[2] ** 2) / 2), [0.3, 0.5, -0.2, 0.1], False),
+    (lambda: (lotka_volterra, lambda t, y: (y - np.log(y)).sum()), [0.5, 0.8], False),
     (energy_squared, [0.5, 0.1, -0.2, 0.6], False),
 ]
 
@@ -286,50 +254,6 @@ def test_a_run_whose_energy_is_lost_later_is_not_trusted(method, drag):
         found = run(fun, energy, start(), (0.0, 12.0), method=method)
     assert not found.trusted
     assert "changes" in found.message
-
-
-def test_compiled_functions_and_interpreted_ones_agree():
-    """26 components; dual numbers give the same gradient, and one of them cannot be taken by dual numbers."""
-
-    @njit
-    def fun(t, y):
-        out = np.empty_like(y)
-        n = y.size // 2
-        out[:n] = y[n:]
-        for k in range(n):
-            left = y[k - 1] if k > 0 else 0.0
-            right = y[k + 1] if k < n - 1 else 0.0
-            out[n + k] = left - 2 * y[k] + right - np.sin(y[k])
-        return out
-
-    @njit
-    def energy(t, y):
-        n = y.size // 2
-        total = (0.0 - y[0]) ** 2 / 2 + y[n - 1] ** 2 / 2
-        for k in range(n):
-            total += y[n + k] ** 2 / 2 + 1 - np.cos(y[k])
-            if k > 0:
-                total += (y[k] - y[k - 1]) ** 2 / 2
-        return total
-
-    @njit
-    def not_for_duals(t, y):
-        return energy(t, y) * np.prod(np.ones(2) + 0 * y[:2])
-
-    by_hand = Invariant(energy, njit(lambda t, y: np.concatenate((-fun(t, y)[13:], y[13:]))), name="H")
-    options = {"method": EIPRK4, "h": 0.05, "reuse_f": False}
-    expected = integrate(fun, (0.0, 5.0), start(), invariants=by_hand, **options)
-    for kept in (energy, not_for_duals):
-        found = integrate(fun, (0.0, 5.0), start(), invariants=Invariant(kept, name="H"), **options)
-        assert found.compiled
-        assert is_from_f(found)
-        np.testing.assert_allclose(found.y, expected.y, rtol=0, atol=1e-13)
-    plain = integrate(fun.py_func, (0.0, 5.0), start(), invariants=Invariant(energy.py_func, name="H"), **options)
-    assert is_from_f(plain)
-    np.testing.assert_allclose(plain.y, expected.y, rtol=0, atol=1e-12)
-    several = ensemble(fun, (0.0, 5.0), [start(), 0.5 * start()], invariants=Invariant(energy, name="H"), **options)
-    one = integrate(fun, (0.0, 5.0), 0.5 * start(), invariants=Invariant(energy, name="H"), **options)
-    np.testing.assert_array_equal(several.y[1], one.y[:, -1])
 
 
 @pytest.mark.parametrize("since", [0.35, 99.0])

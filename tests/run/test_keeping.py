@@ -3,6 +3,8 @@
 import contextlib
 import os
 import signal
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from forked import Forker
 from systems import SQUARE, H, L, orbit, oscillator, pericentre
 
 from eip_scipy import EIPRK4, ensemble, integrate
-from eip_scipy.checkpoint import CheckpointError
+from eip_scipy.checkpoint import CheckpointError, held
 
 Y0 = pericentre(0.6)
 SPAN = (0.0, 6.0)
@@ -181,6 +183,30 @@ def test_a_link_in_the_place_of_the_lock(tmp_path):
     with pytest.raises(CheckpointError, match="cannot write"):
         run(tmp_path / "kept")
     assert (tmp_path / "precious").read_bytes() == b"precious"
+
+
+@pytest.mark.slow
+def test_one_holder_at_any_time(tmp_path):
+    """Each run removes the lock's file when it ends: others that have it open detect that."""
+    inside, most, taken, end = [0], [0], [0], time.monotonic() + 2.0
+
+    def compete():
+        while time.monotonic() < end:
+            with contextlib.suppress(CheckpointError), held(tmp_path / "kept", "integrate", "run", False):
+                inside[0] += 1
+                most[0] = max(most[0], inside[0])
+                taken[0] += 1
+                time.sleep(0)
+                inside[0] -= 1
+
+    threads = [threading.Thread(target=compete) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1]
+    assert taken[0] > 10
+    assert content(tmp_path) == []
 
 
 # SIGTERM.

@@ -141,18 +141,6 @@ def test_invariants_of_several_values(c, options):
     assert one.max_residual.max() < 1e-10
 
 
-@pytest.mark.needs_jit
-def test_an_invariant_in_python_makes_all_calls_python_s(c):
-    fun, H, _, _, dL, event = in_c(c)
-    mixed = fun, H, energy_gradient, momentum, dL, event
-    run = integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, save_every=7)
-    same(run, integrate(**kepler_s(*in_c(c)), method=EIPRK4, h=0.05, save_every=7))
-    assert set(run.calls.values()) == {"python"}
-    assert "(interpreted: gradient of invariant 'H' is not a Numba function" in run.message
-    with pytest.raises(TypeError, match="gradient of invariant 'H' is not a Numba function"):
-        integrate(**kepler_s(*mixed), method=EIPRK4, h=0.05, compiled=True)
-
-
 # Ways to hand them over.
 
 
@@ -329,11 +317,6 @@ def test_refused_functions(c):
             integrate(c.kepler, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU, events=[fun])
 
 
-def test_a_gradient_s_signature_is_another_one(c):
-    with pytest.raises(TypeError, match=r"gradient of invariant 'H' is a C .* expected int .*const double \*f"):
-        Invariant(c.energy, c.energy, name="H")
-
-
 def test_invariants_say_their_size(c):
     sized = partial(Invariant, c.kept, c.kept_gradient)
     refuse(sized, [({"size": size}, ValueError, "size") for size in (0, 1.5, "2")])
@@ -418,7 +401,3 @@ def test_members_are_single_runs(c):
     assert plain.one_by_one == "fun is a C function, which is called for one member at a time"
     with pytest.raises(TypeError, match="fun is a C function by pointer, which cannot be pickled"):
         ensemble(c.kepler, (0, 10), starts, params=masses, executor="dask", **options)
-
-
-def alone(c):
-    return Invariant(c.kept, c.kept_gradient, size=2, name="H L")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
+from systems import BALANCES, H_USES_F, QUARTIC_PARAMS, QUARTIC_START, pericentre, same, swinging
 from systems import JIT_H as H
 from systems import JIT_L as L
 from systems import jit_energy as energy
@@ -13,7 +14,6 @@ from systems import jit_energy_gradient as energy_gradient
 from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
 from systems import jit_orbit as fun
-from systems import pericentre, same
 
 from eip_scipy import (
     EIPDOP853,
@@ -32,11 +32,6 @@ from eip_scipy import (
 pytestmark = pytest.mark.needs_jit
 
 # Kepler: plain, with params, and in place.
-
-
-@njit
-def energy_gradient_of_f(t, y, f):
-    return np.array([-f[2], -f[3], y[2], y[3]])
 
 
 @njit
@@ -165,7 +160,7 @@ COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
 
 
 Y0 = pericentre(0.6)
-H_OF_F = Invariant(energy, energy_gradient_of_f, uses_f=True, name="H")
+H_OF_F = Invariant(energy, njit(H_USES_F.gradient), uses_f=True, name="H")
 HL = Invariant(both, both_gradients, name="HL")
 WITH_PARAMS = [
     Invariant(energy_of_params, energy_gradient_in_place, in_place=True, uses_f=True, name="H"),
@@ -179,6 +174,7 @@ ADAPTIVE = {"method": EIPRK45, "h": None, "rtol": 1e-7, "atol": 1e-10, **SAMPLED
 SECOND_ORDER = {"fun": None, "acceleration": attraction, "h": 0.01}
 GROUPS = [[0, 1, 2], [5, 3]]
 PARAMS = {"params": [1.0], "invariants": WITH_PARAMS}
+BALANCE = {"fun": swinging, "t_span": (0.0, 20.0), "y0": QUARTIC_START, "params": QUARTIC_PARAMS, "h": 0.1}
 WAVES = {"fun": lattice, "t_span": (0.0, 2.0), "y0": Z0, "check": False}
 RUNS = {
     "no invariants, backward": {"invariants": (), "t_span": (0.0, -6.0)},
@@ -208,14 +204,21 @@ RUNS = {
     "multistep, corrected": SECOND_ORDER | {"method": EIPGJ14, "jacobian": attraction_gradient},
     "params": PARAMS | {"fun": fun_of_params, "direction": "old", "iterations": 2},
     "params, in place": PARAMS | {"fun": fun_in_place, "in_place": True},
+    "balance": BALANCE | {"invariants": BALANCES["rate"], "method": EIPDOP853},
+    "balance by f, multistep": BALANCE | {"invariants": BALANCES["f"], "method": EIPGJ12, "h": 0.025},
+    "balance by its gradient, every third": BALANCE | {"invariants": BALANCES["gradient"], "every": 3},
+    "balances by values": BALANCE | {"invariants": BALANCES["pair"]},
+    "balance, adaptive": BALANCE | ADAPTIVE | {"invariants": BALANCES["values"], "t_eval": np.linspace(0.0, 20.0, 33)},
     "waves": WAVES | {"invariants": [ENERGY, MASS], "metric": np.linspace(0.1, 1.0, 7)},
     "waves, frame": WAVES
     | {"invariants": [MASS, ENERGY], "linear_invariants": COMPLEX_FRAME, "blocks": GROUPS, "every": 4},
     "waves, midpoint": WAVES | {"invariants": [MASS, ENERGY], "direction": "midpoint", "compensated": True},
 }
 # They compile functions for themselves alone.
-SLOW = "one of two values", "waves", "waves, frame", "waves, midpoint", "projected start", "multistep, corrected"
-names = pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in RUNS])
+SLOW = "balances by", "one of two", "waves", "projected start", "multistep, corrected"
+names = pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n.startswith(SLOW) else n for n in RUNS]
+)
 
 
 def run(name, **more):
@@ -274,7 +277,7 @@ BY_SCIPY = [
 ]
 
 
-@pytest.mark.parametrize("name", [name for name in BY_SCIPY if name not in SLOW])
+@pytest.mark.parametrize("name", [name for name in BY_SCIPY if not name.startswith(SLOW)])
 def test_solve_ivp_is_the_same_step(name):
     found = run(name, save_every=1, compiled=False)
     options = USUAL | RUNS[name]
@@ -286,11 +289,3 @@ def test_solve_ivp_is_the_same_step(name):
     projected = [*range(0, len(found.t), every), -1] if isinstance(every, int) else [0]
     np.testing.assert_array_equal(sol.y[:, projected], found.y[:, projected])
     assert (sol.nfev, sol.njev, sol.nlu) == (found.nfev, found.njev, found.nlu)
-
-
-def test_results_do_not_depend_on_what_is_saved():
-    """The steps are the same whatever is saved, interpolated or called back, and again in a second run."""
-    end = run("weights").y[:, -1]
-    sampled = {"save_every": None, "t_eval": [0.5, 6.0], "callback": lambda t, y, d: None}
-    for more in ({"save_every": 1}, {"save_every": None}, sampled):
-        np.testing.assert_array_equal(run("weights", **more).y[:, -1], end)

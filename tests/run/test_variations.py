@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from systems import refuse
 
-from eip_scipy import EIPDOP853, Invariant, ensemble, hamiltonian, integrate, load, solve_ivp
+from eip_scipy import EIPDOP853, Invariant, hamiltonian, integrate, solve_ivp
 from eip_scipy.checkpoint import CheckpointError
 
 SPAN, START = (0.0, 3.0), [1.0, 0.3]
@@ -193,21 +193,3 @@ def test_rows_without_a_projection_of_their_own_are_projected(rows, jit):
     q, p = run.y
     gradients = np.column_stack([np.sin(q), p])[:, None] @ run.stm
     np.testing.assert_allclose(gradients, np.tile([np.sin(START[0]), START[1]], (q.size, 1, 1)), rtol=0, atol=2e-15)
-
-
-@pytest.mark.parametrize("rows", [{}, {"save_every": 10}, {"t_eval": [1.0, 2.5]}])
-def test_members_of_an_ensemble_have_the_bits_of_their_runs(tmp_path, rows):
-    options = {"method": EIPDOP853, "h": 0.1, "invariants": [Invariant(energy, name="H")], "variations": ["state", 0]}
-    options |= rows | {"events": lambda t, y, params: y[1]}
-    params = [[0.9], [1.0], [1.1]]
-    found = ensemble(pendulum, SPAN, START, params=params, **options)
-    for k, own in enumerate(params):
-        run = integrate(pendulum, SPAN, START, params=own, **options)
-        last = slice(None) if rows else -1
-        np.testing.assert_array_equal(found.stm[k], run.stm[last])
-        np.testing.assert_array_equal(found.sensitivities[k], run.sensitivities[last])
-        np.testing.assert_array_equal(found.trajectories[k] if rows else found.y[k], run.y if rows else run.y[:, -1])
-        np.testing.assert_array_equal(found.y_events[k][0], run.y_events[0])
-    assert found.columns == run.columns
-    found.save(tmp_path / "members.npz")
-    np.testing.assert_array_equal(load(tmp_path / "members.npz").stm, found.stm)
