@@ -33,7 +33,7 @@ def test_signatures_show_the_options(function):
 
 def test_documentation_names_the_options():
     for name in NAMES:
-        assert f"\n    {name} : " in EIPSolver.__doc__
+        assert f"\n{name} : " in inspect.getdoc(EIPSolver)
     assert ", ".join(NAMES) in integrate.__doc__
     assert "{" + "ProjectionOptions" not in EIPSolver.__doc__ + integrate.__doc__
 
