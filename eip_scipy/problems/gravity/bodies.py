@@ -40,8 +40,9 @@ class BodiesProblem(Problem):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name: ``gm_`` and the name of each body, then the constants of the forces."""
-        names = [*(f"gm_{name}" for name in self.bodies), *(ENTRIES if self.forces else ())]
+        """Values of the parameters by name: ``gm_`` and each body's name, constants of forces, ``beta_`` and names."""
+        behind = (*ENTRIES, *(f"beta_{name}" for name in self.bodies)) if self.forces else ()
+        names = [*(f"gm_{name}" for name in self.bodies), *behind]
         return dict(zip(names, np.asarray(self.params).tolist(), strict=True))
 
     def at_events(self, events: Sequence[Any], times: Any, states: Any, fun: Callable[..., Any]) -> dict[str, Any]:
