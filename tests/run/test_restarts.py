@@ -368,6 +368,7 @@ def test_problems(tmp_path):
     np.testing.assert_array_equal(again.y, longer.y)
     np.testing.assert_array_equal(again.stm, longer.stm)
     assert again.restarts == longer.restarts == []
+    assert (longer.target == longer.targets.T).all()
     other = integrate(ready(), (0, 5), method=EIPRK4).continue_to(9, fun=lambda t, y: ready().fun(t, y))
     assert (other.h, other.restarts, other.diagnostics.names) == (0.03, [(5.0, "fun")], ("H", "L"))
     np.testing.assert_allclose(other.y[:, -1], longer.y[:, -1], rtol=0, atol=1e-4)
