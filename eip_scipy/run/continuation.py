@@ -164,6 +164,11 @@ class _Restart:
     def _params(self, given: Any) -> Any:
         """Return the new parameters; those that a mapping does not name keep their values."""
         problem, now = self.asked["fun"], self.asked["params"]
+        had, size = getattr(problem, "params", now), np.size(given)  # compiled code does not check the size
+        is_known = not (had is None or isinstance(given, Mapping) or {"fun", "acceleration"} & self.changes.keys())
+        if is_known and size != np.size(had):
+            differs = f"params has {size} values, and the run had {np.size(had)}"
+            raise ValueError(f"continue_to: {differs}. Give as many, or fun=... too.")
         if not (isinstance(given, Mapping) and isinstance(problem, Problem)) or now is None:
             return given
         known = now if isinstance(now, Mapping) else zip(problem.parameters, np.ravel(now).tolist(), strict=False)

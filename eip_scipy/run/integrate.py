@@ -309,6 +309,8 @@ class Loop:
                 return 1, STOPPED
         while True:
             if step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
+                if self.keeper is not None:
+                    self.keeper.take_snapshot()
                 return -1, used_up(self._most_steps, driver.now[0])
             if self.keeper is not None:
                 self.keeper.keep()

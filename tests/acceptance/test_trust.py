@@ -542,6 +542,7 @@ def test_a_bound_on_the_number_of_steps(tmp_path):
     assert longer.message.startswith("reached the end of the interval (")
     resumed = integrate(fun, (0, 20), y0, max_steps=1000, resume=True, **options)
     np.testing.assert_array_equal(resumed.y[:, -1], whole.y[:, -1])
+    assert "resumed at step 7" in resumed.message
     assert integrate(fun, (0, 1.1), y0, method=EIPRK4, h=0.1, max_steps=11).status == 0
     with pytest.raises(ValueError, match="max_steps must be an integer >= 1"):
         integrate(fun, (0, 20), y0, method=EIPDOP853, max_steps=0)

@@ -133,7 +133,10 @@ def test_a_pendulum_whose_gravity_changes():
     by_mass = integrate(pendulum, (0, 1), [1.0, 0.0], variations=["m"], **TIGHT)
     refuse(
         by_mass.continue_to,
-        [({"t": 2, "fun": other}, ValueError, r"fun has others, \['k'\], than before, \['g', 'm'\]")],
+        [
+            ({"t": 2, "fun": other}, ValueError, r"fun has others, \['k'\], than before, \['g', 'm'\]"),
+            ({"t": 2, "params": [1.0]}, ValueError, "params has 1 values, and the run had 2"),
+        ],
     )
     run = integrate(pendulum, (0, 1), [1.0, 0.0], params={"m": 0.7}, **TIGHT).continue_to(3, params={"g": 1.62})
     y = [1.0, 0.0]
