@@ -99,6 +99,8 @@ class _Orbits:
             raise ValueError(f"t must be an end time or a finite interval with two different ends, got {shown(t)}.")
         self.fun, self.options, self.params = fun, options, options.pop("params", None)
         y0s = states("y0s", start if y0s is None else y0s)
+        if not y0s.size or not y0s.ndim:
+            raise ValueError(f"y0s must have the shape (..., n) and hold one state at least, got {y0s.shape}.")
         self.grid = y0s.shape[:-1] or np.shape(self.params)[:-1]
         self.each = self.grid and np.ndim(self.params) > 1
         if self.each and np.shape(self.params)[:-1] != self.grid:

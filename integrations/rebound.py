@@ -178,7 +178,8 @@ def to_simulation(
     bodies = bodies_of(run)
     time, start = _chosen(run, bodies.problem, y, row, t)
     if bodies.forces and template is None:
-        theirs = {ours: name for name, ours in _FORCES.items()} | {"j2": "gravitational_harmonics"}
+        theirs = {ours: name for name, ours in _FORCES.items()}
+        theirs |= {"j2": "gravitational_harmonics", "radiation": "radiation_forces"}
         given = ", ".join(f"{name} (REBOUNDx: {theirs.get(name, 'none')})" for name in bodies.forces)
         text = f"Newton's gravitation only, but the problem also has {given}; attach it by REBOUNDx if a run needs it."
         warnings.warn(f"to_simulation: the simulation has {text}", UserWarning, stacklevel=users_level())

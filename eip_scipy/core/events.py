@@ -201,8 +201,9 @@ class Events:
         if isinstance(value, float):
             return value
         found = reals(f"event {k} returned", value)
-        if found is None or found.ndim:
-            raise TypeError(f"event {k} returned {shown(value)} at t={t:.10g}, expected a real number.")
+        if found is None or found.ndim or isinstance(value, bool | np.bool_):
+            what = f"event {k} returned {shown(value)} at t={t:.10g}"
+            raise TypeError(f"{what}, expected a real number that changes its sign, y[0] and not y[0] > 0.")
         return float(found)
 
 

@@ -30,7 +30,7 @@ __all__ = [
     "BY_NAME", "GRADIENT", "AccelerationField", "ChangedShapeError", "CompiledFunction", "Kind", "NotCompilableError",
     "PointerFunction", "are_same", "by_address", "by_pointer", "compilable", "compiled_like", "extra_arguments",
     "floats", "is_compiled", "is_jitted", "is_pointer", "jit_is_off", "jitted", "jitted_call", "names",
-    "native_functions", "own_values", "parameter_values", "reraise_user_exception", "scalars",
+    "native_functions", "own_values", "parameter_values", "reraise_user_exception", "scalars", "without_gradient",
 ]  # fmt: skip
 
 BY_NAME = (
@@ -446,12 +446,17 @@ def _add_invariant(add: Callable[..., None], run: Run, k: int) -> None:
         raise NotCompilableError(f"{name} has args; pass its parameters through params")
     add("inv", item.function, name, value, shape=shape, size=size, real=True)
     if item.gradient is None and not (from_f or isinstance(item.function, PointerFunction)):
-        raise NotCompilableError(f"{name} has no grad, and {invariants.why_not.get(label, NO_DUALS)}")
+        raise NotCompilableError(without_gradient(label, invariants.why_not.get(label, NO_DUALS)))
     form = {"takes_f": item.uses_f, "in_place": item.in_place, "gradient": True}
     add("grad", item.gradient, f"gradient of {name}", gradient, shape=(*shape, size), size=size, **form)
     if alone is not None and alone.by_parameters is not None:
         rows, name = (*shape, alone.parameters), f"derivatives by parameters of {name}"
         add("by_parameters", alone.by_parameters, name, shape=rows, size=size, real=True)
+
+
+def without_gradient(label: str, why: str) -> str:
+    """Return the reason why a run is interpreted if an invariant has no gradient, and none can be compiled."""
+    return f"invariant {label!r} has no grad, and {why}; give it one that is jitted too, Invariant(fun, grad=...)"
 
 
 class ByAddress(NamedTuple):

@@ -228,10 +228,10 @@ class Problem:
         """
         return {}
 
-    def at_events(self, events: Sequence[Any], times: Any, states: Any, fun: Callable[..., Any]) -> dict[str, Any]:
+    def at_events(self, events: Sequence[Any], times: Any, states: Any, params: np.ndarray) -> dict[str, Any]:
         """Return further fields of the result of a run, by name, computed from its events; {} for this class.
 
-        `times` (m,) and `states` (m, n) are those of each event, and ``fun(t, y)`` is the right-hand side.
+        `times` (m,) and `states` (m, n) are those of each event, and `params` (p,) the parameters of the run.
         """
         return {}
 

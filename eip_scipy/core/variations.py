@@ -20,6 +20,7 @@ from .functions import (
     jit_is_off,
     jitted_call,
     scalars,
+    without_gradient,
 )
 from .inputs import filled
 from .invariants import Invariant, copied
@@ -157,7 +158,11 @@ def _augmented(item: Invariant, tangents: TangentVectors, first: First, compiled
     """Return an invariant, with a gradient, as a function of augmented states; `compiled`: see `Unaugmented`."""
     shape = np.shape(item.function(first.t, first.y.copy(), *item.args, *first.extra))
     places = list(tangents.parameters) if first.extra and not item.args else []
-    own = _unaugmented(item, tangents.n, shape, tuple(places), first.extra) if compiled else None
+    own, why = None, ""
+    try:
+        own = _unaugmented(item, tangents.n, shape, tuple(places), first.extra) if compiled else None
+    except NotCompilableError as error:  # the function is then called from Python
+        why = without_gradient(str(item.name or getattr(item.function, "__name__", "?")), str(error))
     by_parameters: Callable[..., Any] | None = None if own is None else own.by_parameters
     known = item if own is None else own.function
     known_gradient = _gradient(known, shape, first)
@@ -181,6 +186,7 @@ def _augmented(item: Invariant, tangents: TangentVectors, first: First, compiled
         return tangents.spread(found, shape, slopes(t, tangents.state(Y), *extra) if places else 0.0)
 
     augmented = copied(item)
+    value.not_jitted = why  # type: ignore[attr-defined]
     augmented.function, augmented.gradient, augmented.args = value, gradient, ()
     augmented.in_place, augmented.uses_f, augmented.unaugmented = False, known.uses_f, own
     return augmented
@@ -209,17 +215,17 @@ def _gradient(item: Invariant, shape: tuple[int, ...], first: First) -> Callable
 def _unaugmented(
     item: Invariant, n: int, shape: tuple[int, ...], parameters: tuple[int, ...], extra: tuple
 ) -> Unaugmented | None:
-    """Return what the engine calls for an invariant; None if it would have to call Python for it."""
+    """Return what the engine calls for an invariant; None if it would have to call Python for it.
+
+    Raise NotCompilableError if dual numbers cannot do what the invariant does.
+    """
     slopes, by_library = None, f"{getattr(item.function, '__name__', '')}{BY_PARAMETERS}"
     has_slopes = not parameters or is_jitted(item.function) or by_library in library
     if item.args or scalars(extra) is None or not (_has_address(item.function) and has_slopes):
         return None
-    try:
-        own = with_duals(item, "gradient", n, shape, extra) if item.gradient is None else item
-        if parameters and by_library in library:
-            slopes = _bound(by_library, parameters, extra)
-        elif parameters:
-            slopes = by_duals("parameter_gradient", own.function, extra[0].size, shape, parameters)
-    except NotCompilableError:  # the function is then called from Python
-        return None
+    own = with_duals(item, "gradient", n, shape, extra) if item.gradient is None else item
+    if parameters and by_library in library:
+        slopes = _bound(by_library, parameters, extra)
+    elif parameters:
+        slopes = by_duals("parameter_gradient", own.function, extra[0].size, shape, parameters)
     return Unaugmented(n, own, slopes, len(parameters)) if _has_address(own.gradient) else None

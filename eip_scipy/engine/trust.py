@@ -84,7 +84,7 @@ class Trust:
         both[:, data.FIRST] = np.where(one[:, data.MANY] > 0, one[:, data.FIRST], two[:, data.FIRST])
         trust = Trust(self.names, both)
         trust.doubts = list(dict.fromkeys(self.doubts + other.doubts))
-        trust.failed = self.failed or other.failed
+        trust.failed = other.failed
         return trust
 
     @property

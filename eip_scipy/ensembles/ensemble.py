@@ -29,6 +29,7 @@ from ..core.solvers import EIPRK4, EIPSolver
 from ..engine.data import N_COUNTERS
 from ..engine.trust import ProjectionWarning
 from ..run.driver import check_bytes, expected_steps, require_memory
+from ..run.integrate import at_events
 from ..run.prepare import DEFAULT, RunArguments, default_method, prepared
 from .checkpoints import opened
 from .executors import results
@@ -342,6 +343,10 @@ class _Collector:
                 result["trajectories"] = rows.swapaxes(1, 2)
             if result.y_events is not None:
                 result["y_events"] = [[tangents.state(rows) for rows in member] for member in result.y_events]
+        if result.y_events is not None:
+            events = zip(members["t_events"], result.y_events, self.everyone.params[first:], strict=False)
+            found = [at_events(ready, *member) for member in events]
+            result |= {name: [member[name] for member in found] for name in found[0]}
         return result
 
 

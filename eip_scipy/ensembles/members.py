@@ -419,7 +419,7 @@ def run_chunk(plan: Plan, chunk: Chunk, *, stop: threading.Event | None = None) 
         return members
     for k in np.flatnonzero(members["status"] >= 0).tolist():
         try:
-            found = plan.task.reduce(_result(plan, members, k))
+            found = plan.task.reduce(_result(plan, members, k, chunk.params[k]))
             value = np.asarray(found)
             if value.dtype.kind not in "biufc":
                 raise TypeError(f"reduce returned {shown(found)}; expected a number or an array of numbers.")
@@ -447,7 +447,7 @@ def placed(out: np.ndarray | None, members: int, first: int, values: np.ndarray)
     return out
 
 
-def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
+def _result(plan: Plan, members: dict[str, Any], k: int, params: np.ndarray) -> IntegrationResult:
     """Return the result of member `k` as `integrate` does, with the fields that do not need the run itself."""
     states, values = (members[name][k].T for name in ("trajectories", "invariants"))
     rows = np.count_nonzero(~np.isnan(states).any(axis=1))
@@ -460,6 +460,7 @@ def _result(plan: Plan, members: dict[str, Any], k: int) -> IntegrationResult:
         states,
         (members["t_events"][k], members["y_events"][k]) if plan.events else None,
         {place: members[name][k] for name, place in COUNTERS.items()},  # type: ignore[arg-type]
+        params,
         t=t,
         invariants=values.T,
         status=int(members["status"][k]),

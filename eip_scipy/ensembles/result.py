@@ -94,6 +94,8 @@ class EnsembleResult(Result):
         last states. `stm` and `sensitivities` are parts of it; `columns` is as in `IntegrationResult`.
     tangent_events, time_derivatives, state_derivatives : list of list of ndarray
         With events and ``variations=``: for member k the lists of `IntegrationResult`, with one array for each event.
+    encounters : list of ndarray, shape (m, 5)
+        The closest approaches of each member, of a problem ``nbody(..., encounters=...)``.
     outputs : dict of str to ndarray, shape (members,) or (members, m)
         For a mechanical system with ``outputs=``: values of these quantities in the same states, computed when they are
         first requested; nan where there is no state.

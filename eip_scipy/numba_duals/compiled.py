@@ -21,7 +21,7 @@ LANES = 12
 STACK = 64
 NUMBERS = {"d": types.float64, "q": types.int64, "?": types.boolean}
 # How the line of Numba's errors begins that names what is missing.
-SAYING = ("No implementation", "Cannot", "Unknown")
+SAYING = ("No implementation", "Cannot", "Unknown", "astype", "dual")
 
 
 class NotDifferentiableError(TypeError):

@@ -24,7 +24,7 @@ from ..core.projection import ProjectionOptions
 from ..core.tangent_vectors import TangentVectors
 from ..engine.data import EPS
 from .fields import OBSERVED, OF_EVENTS, joined
-from .integrate import integrate
+from .integrate import integrate, used_up
 from .origin import Origin
 from .prepare import RunArguments, as_problem, default_method, started_at
 from .results import IntegrationResult, described
@@ -98,10 +98,15 @@ def repeated(result: IntegrationResult, events: Sequence[Any]) -> IntegrationRes
     origin: Origin = vars(result)["_origin"]
     given = origin.arguments
     t0 = started_at(RunArguments.of(**given | {"variations": None}))[0]
+    if origin.sign * (t0 - result.t[0]) > 0:
+        raise ValueError(
+            f"transits: the run was continued at t={t0:.10g}. Pass a run of integrate(problem, ({result.t[0]:.10g}, "
+            f"{origin.t:.10g}), ...) in one call; or if the run was changed there, one run for each part."
+        )
     if result.t[0] != t0:
         raise ValueError(
-            f"the run begins at t={t0:.10g}, but its first saved state is at t={result.t[0]:.10g}. Pass a run of "
-            "integrate that was not continued, and that saves its start."
+            f"transits: the run begins at t={t0:.10g}, but its first saved state is at t={result.t[0]:.10g}. Pass a "
+            "run that saves its start: omit t_eval, or let it begin there."
         )
     asked = given | dict.fromkeys(SAVING) | {"t_span": (t0, origin.t), "events": tuple(events)}
     if isinstance(tangents := given["variations"], TangentVectors):  # those at the end of the run
@@ -159,6 +164,11 @@ class _Restart:
     def _params(self, given: Any) -> Any:
         """Return the new parameters; those that a mapping does not name keep their values."""
         problem, now = self.asked["fun"], self.asked["params"]
+        had, size = getattr(problem, "params", now), np.size(given)  # compiled code does not check the size
+        is_known = not (had is None or isinstance(given, Mapping) or {"fun", "acceleration"} & self.changes.keys())
+        if is_known and size != np.size(had):
+            differs = f"params has {size} values, and the run had {np.size(had)}"
+            raise ValueError(f"continue_to: {differs}. Give as many, or fun=... too.")
         if not (isinstance(given, Mapping) and isinstance(problem, Problem)) or now is None:
             return given
         known = now if isinstance(now, Mapping) else zip(problem.parameters, np.ravel(now).tolist(), strict=False)
@@ -352,9 +362,11 @@ def _joined(
     grown = dict(vars(one).get("_grown", {}))
     fields = joined(one, two, grown, apart=bool(changes), but=() if before == after else OF_EVENTS)
     both = IntegrationResult(fields)
-    if one.status < 0:
-        doubts = both.diagnostics._trust.doubts
-        doubts.append(f"the part of the run up to t={first.t:.6g} did not end regularly: {first.ended}")
+    trust, known = one.diagnostics._trust, both.diagnostics._trust.doubts
+    if one.status < 0 and first.ended == used_up(first.arguments.get("max_steps") or 0, first.t):
+        both["trusted"] = two.trusted and not (trust.doubts or trust.exceeds_bounds)
+    elif one.status < 0:
+        known.append(f"the part of the run up to t={first.t:.6g} did not end regularly: {first.ended}")
     last = last._replace(notes=tuple(dict.fromkeys(first.notes + last.notes)))
     both["message"] = described(last.ended, both.diagnostics, last.notes)
     object.__setattr__(both, "_origin", last)

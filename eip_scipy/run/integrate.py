@@ -309,6 +309,8 @@ class Loop:
                 return 1, STOPPED
         while True:
             if step >= self._most_steps and driver.now[0] != schedule.span.t_bound:
+                if self.keeper is not None:
+                    self.keeper.take_snapshot()
                 return -1, used_up(self._most_steps, driver.now[0])
             if self.keeper is not None:
                 self.keeper.keep()
@@ -437,6 +439,7 @@ class Loop:
             driver.y[:rows],
             (events.t, events.y) if events.functions else None,
             run.work.counters,
+            run.problem.parameters,
             t=driver.t[:rows],
             invariants=values.T,
             target=target,
@@ -456,11 +459,10 @@ class Loop:
         last, values_at, at_end = (np.array([t]), y[None].copy()), driver.values_at, not self._event_ended
         arguments = {**asked._asdict(), **asked.projection, "params": copy(asked.params)}  # the user may change it
         del arguments["projection"]
-        figures = run.trust.figures
         saved = rows > 0 and driver.t[rows - 1] == t and np.array_equal(driver.y[rows - 1], y)
         origin = Origin(
             arguments, t, run.tangents.state(y.copy()), driver.schedule.span.sign, tuple(run.invariants.names),
-            terms=np.where(np.isnan(target), np.inf, figures[:, START]),  # balances have no target
+            terms=np.where(np.isnan(target), np.inf, run.trust.figures[:, START]),  # balances have no target
             before=values[-1].copy() if saved else None,
             event=events.last_index if self._event_ended else None,
             kept=lambda: kept(at_end=at_end) if variations is None else variations.with_targets(kept(at_end=at_end)),
@@ -483,11 +485,13 @@ class Loop:
         return tuple(str(note) for note in (*notes, run.conserved.missing, *self.remarks) if note is not None)
 
 
-def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fields: Any) -> IntegrationResult:
+def assembled(
+    run: Run, y: np.ndarray, events: Any, counters: np.ndarray, params: np.ndarray, **fields: Any
+) -> IntegrationResult:
     """Return a result with the given `fields` and those that follow from the `run`.
 
     `y` (m, n) are the saved states, with the tangent vectors that follow them, and `events` the times and states of
-    each event; None without events. `counters` are those of the engine.
+    each event; None without events. `counters` are those of the engine, and `params` the parameters.
     """
     problem, tangents = run.problem.problem, run.tangents
     result = IntegrationResult(
@@ -504,14 +508,19 @@ def assembled(run: Run, y: np.ndarray, events: Any, counters: np.ndarray, **fiel
         units="" if problem is None else problem.units,
         epoch=None if problem is None else problem.epoch,
     )
-    if problem is not None and events is not None:
-        own = [getattr(getattr(x, "unaugmented", None), "function", x) for x in run.problem.events.functions]
-        fun = tangents.of_state(run.problem.derivative, run.problem.y0)
-        result |= problem.at_events(own, result.t_events, result.y_events, fun)
+    if events is not None:
+        result |= at_events(run, result.t_events, result.y_events, params)
     if run.problem.variations is not None:
         result["variations"] = tangents.split(y)[1]
         result["columns"] = run.problem.described_columns
     return result
+
+
+def at_events(run: Run, times: Any, states: Any, params: np.ndarray) -> dict[str, Any]:
+    """Return the fields that the problem of a run computes from the times and states of each event."""
+    problem, functions = run.problem.problem, run.problem.events.functions
+    own = [getattr(getattr(function, "unaugmented", None), "function", function) for function in functions]
+    return {} if problem is None else problem.at_events(own, times, states, params)
 
 
 def used_up(most_steps: int, t: float) -> str:

@@ -333,7 +333,7 @@ class IntegrationResult(Result):
     restarts : list of (float, str)
         Times at which `continue_to` has restarted the run with a change, and the names of what was given: "y, params".
     targets : ndarray, shape (l, m)
-        If restarts have changed targets, or the invariants: the targets at the saved times. `target` has the last ones.
+        Targets of the invariants at the saved times, which differ if restarts have changed them. `target` has the last.
     units : str
         Units of the `Problem`; "" without one.
     epoch : (float, float) or None
@@ -382,6 +382,12 @@ class IntegrationResult(Result):
     state_derivatives: list[np.ndarray]
 
     plot = plot
+
+    @property
+    def targets(self) -> np.ndarray:
+        """Targets of the invariants at the saved times, (l, m); NaN for a `Balance`."""
+        found = np.asarray(self["target"])[:, None]
+        return self["targets"] if "targets" in self else np.broadcast_to(found, self["invariants"].shape)
 
     def continue_to(
         self,

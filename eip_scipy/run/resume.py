@@ -123,7 +123,7 @@ class Checkpointer:
         if found is not None:
             self._restore(*found)
         self._begin = time.perf_counter() - self.seconds
-        self._take_snapshot()
+        self.take_snapshot()
         self._written = self._where()
         self._due = time.perf_counter() + self._every
         if found is None:
@@ -191,14 +191,14 @@ class Checkpointer:
         """Store a snapshot or write the file if it is due; called between two chunks of steps."""
         now = time.perf_counter()
         if now >= min(self._due, self._next_snapshot):
-            self._take_snapshot()
+            self.take_snapshot()
         if now >= self._due:
             self._write_or_warn(None, "running")
 
     def end(self, status: int, message: str) -> None:
         """Record that the run has ended regularly."""
         if status == 0:
-            self._take_snapshot()
+            self.take_snapshot()
         step = int(self._snapshot[0]["place"][STEP])
         if self._ended != (status, message, step):  # otherwise the file already contains this
             self._write_or_warn(status, message)
@@ -215,7 +215,8 @@ class Checkpointer:
             f"the checkpoint {self._name!r} holds {self._written}: the same call with resume=True continues from there"
         )
 
-    def _take_snapshot(self) -> None:
+    def take_snapshot(self) -> None:
+        """Store a snapshot, which the next file holds; called between two chunks of steps."""
         begin = time.perf_counter()
         # One assignment, so that an interruption leaves a whole snapshot: buffers, numbers of events, and run time.
         parts = {name: part.copy() for name, part in self._driver.parts().items()}

@@ -414,8 +414,12 @@ def test_a_bound_on_the_number_of_steps(tmp_path):
     run = integrate(fun, (0, 20), y0, max_steps=7, **options)
     assert (run.status, run.success) == (-1, False)
     assert run.message.startswith(f"max_steps=7 steps were made, up to t={run.t[-1]:.10g}")
+    longer = run.continue_to(20).continue_to(20, max_steps=None)
+    assert (run.trusted, longer.trusted) == (False, True)
+    assert longer.message.startswith("reached the end of the interval (")
     resumed = integrate(fun, (0, 20), y0, max_steps=1000, resume=True, **options)
     np.testing.assert_array_equal(resumed.y[:, -1], whole.y[:, -1])
+    assert "resumed at step 7" in resumed.message
     assert integrate(fun, (0, 1.1), y0, method=EIPRK4, h=0.1, max_steps=11).status == 0
 
 

@@ -1,6 +1,7 @@
 """Gradients that are not given: compiled ones of jitted invariants against mpmath, and in runs; quadratic forms."""
 
 import math
+import re
 
 import mpmath
 import numpy as np
@@ -9,7 +10,7 @@ from systems import jit_energy as energy
 from systems import jit_momentum as momentum
 from systems import jit_orbit as fun
 
-from eip_scipy import EIPDOP853, Invariant, integrate
+from eip_scipy import EIPDOP853, EIPRK4, Invariant, integrate
 from eip_scipy.core.invariant_set import InvariantSet
 
 numba = pytest.importorskip("numba")
@@ -172,6 +173,18 @@ def test_a_function_that_dual_numbers_cannot_take_runs_interpreted_and_says_so()
     assert not result.compiled
     assert "invariant 'L' has no grad, and it does not compile for dual numbers: No implementation" in result.message
     assert "prod" in result.message
+    assert "give it one that is jitted too, Invariant(fun, grad=...)" in result.message
+
+
+@pytest.mark.parametrize(("body", "says"), [("y.astype(np.float32)[0]", "astype"), ("np.median(y)", "median")])
+def test_what_dual_numbers_cannot_do_is_named_with_tangent_vectors_too(body, says):
+    names = {"np": np}
+    exec(f"def value(t, y):\n    return y[0] ** 2 + y[1] ** 2 + 0 * {body}", names)
+    kept = Invariant(njit(names["value"]), name="E")
+    turning = njit(lambda t, y: np.array([y[1], -y[0]]))
+    options = {"method": EIPRK4, "h": 0.1, "invariants": kept, "variations": "state"}
+    found = integrate(turning, (0, 1), [1.0, 0.0], **options).message
+    assert re.search(f"'E' has no grad, and it does not compile for dual numbers: .*{says}.*; give it one", found)
 
 
 def test_a_slow_run_warns_once_that_its_invariant_is_not_jitted(monkeypatch):

@@ -8,6 +8,8 @@ from itertools import combinations, permutations
 import mpmath
 import numpy as np
 import pytest
+from closed_forms import kepler_state
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from systems import AU_KM, DAY_S
 
@@ -252,6 +254,54 @@ def test_nystrom_methods_say_why_they_cannot():
             integrate(mercury(forces), method=EIPRKN12)
 
 
+# --- radiation ---
+
+
+def dust(beta, c, e, t):
+    """Return a particle that starts from the pericentre of the orbit that it has by pressure alone, with G M = 1."""
+    v = math.sqrt((1 - beta) * (1 + e))
+    constants = ForceConstants(c=c, beta=[0, beta])
+    sun, particle = (np.zeros(3), np.zeros(3)), ([1, 0, 0], [0, v, 0])
+    return nbody([1, 0], *zip(sun, particle, strict=True), t_span=(0.0, t), forces="radiation", constants=constants)
+
+
+def test_pressure_weakens_the_suns_attraction_and_drag_shrinks_the_orbit():
+    beta, e, t = 0.3, 0.4, 20.0
+    run = integrate(dust(beta, math.inf, e, t), method=EIPDOP853, rtol=1e-12, atol=1e-13)
+    scale = math.sqrt(1 - beta)
+    x, y, u, v = kepler_state([1, 0, 0, math.sqrt(1 + e)], scale * t)
+    np.testing.assert_allclose(run.y[[3, 4, 9, 10], -1], [x, y, scale * u, scale * v], rtol=1e-9)
+    c, t = 1e4, 300.0  # a^2 falls by 4 beta G M / c in a unit of time
+    y = integrate(dust(beta, c, 0.0, t), method=EIPDOP853, rtol=1e-12, atol=1e-13).y[:, -1]
+    a = (1 - beta) / (2 * (1 - beta) / np.linalg.norm(y[3:6]) - y[9:] @ y[9:])
+    assert 1 - a**2 == pytest.approx(4 * beta * t / c, rel=1e-5)
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.02])
+def test_radiation_on_a_third_body_is_that_of_scipy(mass):
+    """Light comes from the first body, and has no reaction on it: with a mass, momentum and energy are lost."""
+    gm, beta, c = np.array([1.0, 0.3, mass]), np.array([0.0, 0.0, 0.25]), 10.0
+    given = problem("radiation", ForceConstants(c=c, beta=beta), gm, POSITION[:3], VELOCITY[:3])
+
+    def rhs(t, y):
+        q, v = y.reshape(2, 3, 3)
+        d = q[None] - q[:, None]
+        r3 = (np.sum(d**2, axis=2) + np.eye(3)) ** 1.5
+        a = np.sum(gm[None, :, None] * d / r3[..., None], axis=1)
+        x, w = q[2] - q[0], v[2] - v[0]
+        r = np.linalg.norm(x)
+        a[2] += beta[2] * gm[0] / r**2 * ((1 - x @ w / (r * c)) * x / r - w / c)
+        return np.concatenate([v, a]).ravel()
+
+    assert [item.name for item in given.invariants] == ([] if mass else ["H", "L"])
+    assert (given.linear_invariants is None) == (mass > 0)
+    run = integrate(given, (0, 3), method=EIPDOP853, rtol=1e-11, atol=1e-12)
+    exact = solve_ivp(rhs, (0, 3), given.y0, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(run.y[:, -1], exact, atol=1e-9)
+    assert run.trusted
+    assert all(rate(item, given) < 1e-15 for item in given.invariants)
+
+
 # --- the solar system's constants ---
 
 
@@ -296,6 +346,10 @@ WRONG = [
     (None, CONSTANTS, {}, "must be a name or a sequence of names, got None"),
     ("1pn", CONSTANTS, {"gm": [0.0, 1.0, 1.0, 1.0]}, "the first body must be the one that exerts the forces"),
     *(((), None, {"gm": [1.0, gm, 0, 0]}, r"gm\[1\] is") for gm in (-1.0, math.nan, math.inf)),
+    ("radiation", CONSTANTS, {}, r"'radiation' needs constants=ForceConstants\(beta="),
+    ("radiation", ForceConstants(c=0.0), {}, "c must be a positive number, or numpy.inf for the pressure alone"),
+    *(("radiation", replace(CONSTANTS, beta=beta), {}, "beta must be 4 numbers that are not negative")
+      for beta in (0.1, [0, 0.1], [0.1, 0, 0, 0], [0, 0, -0.1, 0], [0, 0, math.nan, 0])),
     ((), None, {"gm": np.zeros(4)}, "every G m is 0"),
     ((), None, {"position": POSITION * np.nan}, "must be finite"),
     *(((), None, {"position": POSITION[[k if k != j else i for k in range(4)]]}, f"bodies {i} and {j} are at the same")

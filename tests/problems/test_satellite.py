@@ -113,6 +113,7 @@ def test_what_is_refused():
         (lambda: orbit(balances="total"), "unknown quantity 'total'"),
         (lambda: satellite([1, 2], [3, 4], mu=1, radius=1, t_span=(0, 1)), "position has shape"),
         (lambda: solar_system(forces="drag"), "needs an atmosphere"),
+        (lambda: solar_system(forces="radiation"), "needs beta; see nbody"),
     ]:
         with pytest.raises(ValueError, match=match):
             make()

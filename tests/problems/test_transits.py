@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import minimize_scalar
 
-from eip_scipy import EIPDOP853, EIPRKN12, integrate, load
+from eip_scipy import EIPDOP853, EIPRKN12, ensemble, integrate, load
 from eip_scipy.problems import kepler, nbody, transits
 
 GM = [1.0, 1e-3, 1e-3, 0.0]
@@ -78,6 +78,18 @@ def test_encounters_backwards_continued_stored_and_with_other_events(tmp_path):
     with pytest.raises(AttributeError, match=r"no encounters; .* events=\[mine, \*problem.events\]"):
         alone.encounters  # noqa: B018
     assert integrate(watched(encounters=1e-9), **TIGHT).encounters.shape == (0, 5)
+
+
+def test_members_of_ensembles_have_the_encounters_of_single_runs():
+    problem, params = watched(), np.outer([1.0, 0.8], GM)
+    y0s = problem.y0 + 1e-3 * np.random.default_rng(0).standard_normal((2, 24))
+    many = ensemble(problem, y0s=y0s, params=params, **TIGHT)
+    times = ensemble(problem, y0s=y0s, params=params, reduce=lambda run: run.encounters[:, 0].sum(), **TIGHT).reduced
+    for k, found in enumerate(many.encounters):
+        alone = integrate(problem, y0=y0s[k], params=params[k], **TIGHT).encounters
+        assert len(alone) > 0
+        np.testing.assert_allclose(found, alone, rtol=1e-7)
+        assert times[k] == pytest.approx(alone[:, 0].sum(), rel=1e-7)
 
 
 @pytest.mark.parametrize("wrong", [-1.0, 0.0, np.inf, [1.0, 2.0], [0.0] * 4])
@@ -182,7 +194,8 @@ def test_wrong_arguments():
         (ValueError, "star must be an index below 4 or one of", (run, 4)),
         (ValueError, "star must be an index below 4 or one of", (run, "Sun")),
         (ValueError, "axis must be three finite numbers, not all 0", (run, 0, (0, 0, 0))),
-        (ValueError, "Pass a run of integrate that was not continued", (run.continue_to(2),)),
+        (ValueError, r"continued at t=1. Pass a run of integrate\(problem, \(0, 2\), ...\)", (run.continue_to(2),)),
+        (ValueError, "saves its start: omit t_eval", (integrate(problem, t_eval=[0.5], **TIGHT),)),
     ]:
         with pytest.raises(error, match=says):
             transits(*arguments)
@@ -206,5 +219,5 @@ def test_command(tmp_path):
     pytest.importorskip("rebound")
     from eip_scipy_studies.cli import main
 
-    assert main(["transits", "--years", "0.2", "--derivative-years", "0.1", "--out", str(tmp_path), "--quiet"]) == 0
+    assert main(["transits", "--years", "0.1", "--out", str(tmp_path), "--quiet"]) == 0
     assert len((tmp_path / "transits.csv").read_text().splitlines()) == 7

@@ -161,7 +161,8 @@ def test_newton(n):
 
 
 RELATIVITY = [(), ("1pn",), ("eih",), ("gr-potential",)]
-OTHERS = [(), ("j2",), ("j4",), ("moon-quadrupole",), ("j2", "j4", "moon-quadrupole"), ("drag",), ("j2", "drag")]
+OTHERS = [(), ("j2",), ("j4",), ("moon-quadrupole",), ("j2", "j4", "moon-quadrupole"), ("drag",)]
+OTHERS += [("j2", "drag", "radiation")]
 # They make all forces as large as Newton's.
 CONSTANTS = ForceConstants(
     c=1.5,
@@ -177,9 +178,15 @@ CONSTANTS = ForceConstants(
 )
 
 
+def constants(n):
+    """Return the constants for n bodies, the last of which stands for two; radiation acts on some that have a mass."""
+    acts = [True] if n == 2 else np.arange(1, n) % 2 == 0
+    return replace(CONSTANTS, moon_body=n - 1, beta=np.append(0.0, 0.1 * np.array(acts)))
+
+
 @pytest.mark.parametrize("n", [2, 4, 10])
 def test_forces(n):
-    options = {"t_span": (0.0, 1.0), "constants": replace(CONSTANTS, moon_body=n - 1)}
+    options = {"t_span": (0.0, 1.0), "constants": constants(n)}
     for relativity, others in product(RELATIVITY, OTHERS):
         rng = np.random.default_rng(n)
         for particles in (False, True):
@@ -193,7 +200,7 @@ def test_forces(n):
 def test_derivatives_by_masses_and_constants(n, relativity, others):
     """Sensitivities of short runs against differences of order 8 in each parameter."""
     rng = np.random.default_rng(n)
-    options = {"constants": replace(CONSTANTS, moon_body=n - 1), "forces": (*relativity, *others)}
+    options = {"constants": constants(n), "forces": (*relativity, *others)}
     problem = nbody(*bodies(rng, n, test_particles=n > 2), t_span=(0.0, 0.1), **options)
     names = [name for name, value in problem.parameters.items() if name[:3] == "gm_" or value != 0]
     names = [name for name in names if name not in ("relativity", "moon_body")]
@@ -220,6 +227,12 @@ def test_what_is_no_constant_has_no_derivative():
         integrate(problem, method=EIPDOP853, h=0.1, variations=["relativity"])
     with pytest.raises(ValueError, match="the parameter 'j2' chooses a force, or belongs to one that"):
         integrate(problem, method=EIPDOP853, h=0.1, variations=["gm_0", "j2"])
+    with pytest.raises(ValueError, match="the parameter 'beta' chooses a force, or belongs to one that"):
+        integrate(problem, method=EIPDOP853, h=0.1, variations=["beta_1"])
+    particle = [1.0, 0.0], np.eye(3)[:2], np.eye(3)[:2][::-1]
+    problem = nbody(*particle, t_span=(0.0, 1.0), forces="radiation", constants=constants(2))
+    with pytest.raises(ValueError, match="derivative by G m of body 1, which is 0, while radiation acts on it"):
+        integrate(problem, method=EIPDOP853, h=0.1, variations=["gm_1"])
 
 
 def test_columns_do_not_depend_on_each_other():

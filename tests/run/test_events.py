@@ -304,7 +304,7 @@ def test_a_run_that_starts_beyond_a_limit_ends_there(direction, native):
     assert 5 < ended.t[-1] < 2 * math.pi
 
 
-@pytest.mark.parametrize("value", [[0.5], np.ones(1), np.ones(2), 0.5j, np.complex128(1), None, "1"])
+@pytest.mark.parametrize("value", [[0.5], np.ones(1), np.ones(2), 0.5j, np.complex128(1), None, "1", True, np.True_])
 @pytest.mark.parametrize("late", [-1.0, 0.5])
 def test_an_event_returns_a_real_number(value, late):
     """Without the check CPython raises SystemError, without a word of the event."""

@@ -133,7 +133,10 @@ def test_a_pendulum_whose_gravity_changes():
     by_mass = integrate(pendulum, (0, 1), [1.0, 0.0], variations=["m"], **TIGHT)
     refuse(
         by_mass.continue_to,
-        [({"t": 2, "fun": other}, ValueError, r"fun has others, \['k'\], than before, \['g', 'm'\]")],
+        [
+            ({"t": 2, "fun": other}, ValueError, r"fun has others, \['k'\], than before, \['g', 'm'\]"),
+            ({"t": 2, "params": [1.0]}, ValueError, "params has 1 values, and the run had 2"),
+        ],
     )
     run = integrate(pendulum, (0, 1), [1.0, 0.0], params={"m": 0.7}, **TIGHT).continue_to(3, params={"g": 1.62})
     y = [1.0, 0.0]
@@ -368,6 +371,7 @@ def test_problems(tmp_path):
     np.testing.assert_array_equal(again.y, longer.y)
     np.testing.assert_array_equal(again.stm, longer.stm)
     assert again.restarts == longer.restarts == []
+    assert (longer.target == longer.targets.T).all()
     other = integrate(ready(), (0, 5), method=EIPRK4).continue_to(9, fun=lambda t, y: ready().fun(t, y))
     assert (other.h, other.restarts, other.diagnostics.names) == (0.03, [(5.0, "fun")], ("H", "L"))
     np.testing.assert_allclose(other.y[:, -1], longer.y[:, -1], rtol=0, atol=1e-4)

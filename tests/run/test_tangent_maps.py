@@ -305,6 +305,10 @@ def test_bad_input():
         ({"t": 0}, ValueError, "two different ends"),
         ({"variations": "state"}, TypeError, "set the option 'variations'"),
         ({"y0s": np.zeros((2, 3, 2)), "params": np.zeros((3, 1))}, ValueError, r"params must have the shape \(p,\) or"),
+        *(
+            ({"y0s": y0s}, ValueError, "y0s must have the shape .* and hold one state")
+            for y0s in (3.0, np.zeros((0, 2)))
+        ),
     ]
     indicator = [
         ({"t": (2, 2)}, ValueError, "two different ends"),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...core.inputs import shown
-from ...core.problem import Problem
+from ...core.problem import Problem, bind
 
 # Names of the parameters that follow G m of each body if there are further forces; the order is that of forces.cpp.
 ENTRIES = (
@@ -40,15 +40,18 @@ class BodiesProblem(Problem):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name: ``gm_`` and the name of each body, then the constants of the forces."""
-        names = [*(f"gm_{name}" for name in self.bodies), *(ENTRIES if self.forces else ())]
+        """Values of the parameters by name: ``gm_`` and each body's name, constants of forces, ``beta_`` and names."""
+        behind = (*ENTRIES, *(f"beta_{name}" for name in self.bodies)) if self.forces else ()
+        names = [*(f"gm_{name}" for name in self.bodies), *behind]
         return dict(zip(names, np.asarray(self.params).tolist(), strict=True))
 
-    def at_events(self, events: Sequence[Any], times: Any, states: Any, fun: Callable[..., Any]) -> dict[str, Any]:
+    def at_events(self, events: Sequence[Any], times: Any, states: Any, params: np.ndarray) -> dict[str, Any]:
         """Return the encounters of a run, see `Problem.at_events`."""
         from .approaches import encounters  # which imports this module
 
-        table = None if self.radii is None else encounters(self.radii, events, times, states, fun)
+        if self.radii is None or self.rhs is None:
+            return {}
+        table = encounters(self.radii, events, times, states, bind(self.rhs, params))
         return {} if table is None else {"encounters": table}
 
 

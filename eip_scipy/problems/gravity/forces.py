@@ -1,10 +1,10 @@
-"""Forces in addition to Newton's gravitation: relativity, oblateness, a Moon without orbit, drag.
+"""Forces in addition to Newton's gravitation: relativity, oblateness, a Moon without orbit, drag, radiation.
 
 All terms are chosen by numbers in the vector of parameters, so that one right-hand side serves every combination: first
-G m of each body, then `N_ENTRIES` entries of the forces. The first body is the Sun; each force on another body has its
-reaction on the Sun, so that momentum and centre of mass are those of Newton. The full post-Newtonian equations ("eih")
-have another momentum and another centre of mass. They are in engine/cpp/problems/einstein.hpp, and the other forces in
-forces.cpp there. A new force is one row of `FORCES` here.
+G m of each body, then `N_ENTRIES` entries of the forces, then beta of each body. The first body is the Sun; each force
+on another body except "radiation" has its reaction on the Sun, so that momentum and centre of mass are Newton's. The
+full post-Newtonian equations ("eih") have another momentum and another centre of mass. They are in
+engine/cpp/problems/einstein.hpp, and the other forces in forces.cpp there. A new force is one row of `FORCES` here.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...core.inputs import real_array
 from ...core.invariants import Invariant
 from ...core.names import nearest
 from ...core.problem import native_invariant
@@ -39,7 +40,7 @@ class ForceConstants:
     Attributes
     ----------
     c : float, optional
-        Speed of light, for "1pn", "eih" and "gr-potential".
+        Speed of light, for "1pn", "eih", "gr-potential" and "radiation", there ``numpy.inf`` for the pressure alone.
     j2 : float, optional
         J2 times the square of the Sun's equatorial radius, for "j2".
     j4 : float, optional
@@ -53,6 +54,8 @@ class ForceConstants:
         Acceleration divided by the squared speed relative to the air, which is half the density of the air times
         c_D A / m of the bodies, at the distance `drag_radius` from the first body; the distance over which the density
         falls by a factor of e; and the angular velocity of the air about the pole, for "drag".
+    beta : sequence of N floats, optional
+        Radiation pressure over the Sun's gravitation, of each body, 0 for the Sun; for "radiation".
     """
 
     c: float | None = None
@@ -65,6 +68,7 @@ class ForceConstants:
     drag_radius: float | None = None
     scale_height: float | None = None
     spin: float = 0.0
+    beta: Sequence[float] | None = None
 
 
 class Force(NamedTuple):
@@ -78,7 +82,11 @@ class Force(NamedTuple):
 
 
 def _relativity(kind: int) -> Callable[[Any], dict[int, Any]]:
-    return lambda k: {KIND: kind, OVER_C2: 1.0 / np.float64(k.c) ** 2}
+    return lambda k: {KIND: kind} | _over_c2(k)
+
+
+def _over_c2(k: ForceConstants) -> dict[int, Any]:
+    return {OVER_C2: 1.0 / np.float64(k.c) ** 2}
 
 
 def _drag(k: ForceConstants) -> dict[int, Any]:
@@ -99,6 +107,7 @@ FORCES = {
     "j4": Force(("j4", "pole"), lambda k: {OBLATENESS_4: k.j4} | _pole(k), keeps=("H", "L_pole")),
     "moon-quadrupole": Force(("moon_body", "moon"), lambda k: {MOON_BODY: k.moon_body, MOON: k.moon}),
     "drag": Force(("drag", "drag_radius", "scale_height"), _drag, keeps=(), sees_velocity=True),
+    "radiation": Force(("c", "beta"), _over_c2, sees_velocity=True),
 }
 """The forces by name; `nbody` describes each of them."""
 
@@ -120,7 +129,7 @@ def check_forces(forces: Any) -> tuple[str, ...]:
 
 
 def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstants | None) -> np.ndarray:
-    """Return the vector of parameters: G m of all bodies, then the entries of the forces, if there are any.
+    """Return the vector of parameters: G m of all bodies, then the entries of the forces and beta, if there are any.
 
     A ValueError is raised if a constant is missing or wrong, or the first body has no mass.
     """
@@ -138,7 +147,12 @@ def parameters(gm: np.ndarray, forces: tuple[str, ...], constants: ForceConstant
         raise ValueError(
             f"forces: the first body must be the one that exerts the forces, with G m > 0; its G m is {gm[0]!r}."
         )
-    return np.concatenate([gm, entries])
+    return np.concatenate([gm, entries, known.beta if "radiation" in forces else np.zeros(gm.size)])
+
+
+def has_radiating_masses(params: np.ndarray, n: int) -> bool:
+    """Return True if radiation acts on one of n bodies that has a mass, so that Newton's invariants do not hold."""
+    return params.size > n and bool((params[:n] * params[n + N_ENTRIES :]).any())
 
 
 def _check_constant(force: str, name: str, value: Any, n: int) -> None:
@@ -149,6 +163,11 @@ def _check_constant(force: str, name: str, value: Any, n: int) -> None:
         fits = pole.shape == (3,) and np.isfinite(pole).all() and pole.any()
     elif name == "moon_body":
         fits, expected = isinstance(value, int | np.integer) and 0 < value < n, f"an index from 1 to {n - 1}"
+    elif name == "beta":
+        betas, expected = real_array("beta", value), f"{n} numbers that are not negative, the first one, the Sun's, 0"
+        fits = betas.shape == (n,) and np.isfinite(betas).all() and (betas >= 0).all() and betas[0] == 0
+    elif force == "radiation":
+        fits, expected = value > 0, "a positive number, or numpy.inf for the pressure alone"
     elif name in ("spin", "j4"):
         fits, expected = isfinite(value), "a finite number"
     else:
@@ -171,7 +190,7 @@ def invariants(forces: tuple[str, ...], params: np.ndarray, y0: np.ndarray) -> t
         group = "pair" if y0.size <= 12 and len(forces) == 1 else ""
     elif "eih" in forces:
         group = "eih" if _small_second_order(params, y0) else ""
-    if not (group and all(row.keeps for row in rows)):
+    if not (group and all(row.keeps for row in rows)) or has_radiating_masses(params, y0.size // 6):
         return ()
     axial = any("L_pole" in row.keeps for row in rows)
     momentum = ("axial_momentum", "L_pole") if axial else ("momentum", "L")

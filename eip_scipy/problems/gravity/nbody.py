@@ -62,7 +62,7 @@ def nbody(
         Step length.
     forces : str or sequence of str, optional
         Forces in addition to Newton's gravitation: at most one of "1pn", "eih" and "gr-potential", and "j2",
-        "j4", "moon-quadrupole" and "drag". All act from the first body (the Sun) except "eih". The page
+        "j4", "moon-quadrupole", "drag" and "radiation". All act from the first body (the Sun) except "eih". The page
         :doc:`/reference/forces` describes them.
     constants : ForceConstants, optional
         The speed of light and the other constants of the forces, in the units of the state.
@@ -109,8 +109,9 @@ def nbody(
 
     With further forces the problem has those invariants that its equations conserve; the page lists them. Newton's
     momentum and centre of mass are exact invariants of all forces except "eih", whose momentum has further terms in
-    1/c^2; there the frame only keeps corrections from moving the centre of mass. With "1pn", "eih" and "drag" the
-    accelerations depend on velocities: `acc` is None, and Nystrom methods do not apply.
+    1/c^2 (there the frame only keeps corrections from moving the centre of mass), and "radiation" on a body that has a
+    mass. With "1pn", "eih", "drag" and "radiation" the accelerations depend on velocities: `acc` is None, and Nystrom
+    methods do not apply.
 
     From 128 bodies on the sums over pairs use several threads: as many as the environment variable ``OMP_NUM_THREADS``
     says when the first run begins, or else as many as there are processors, up to 16; 1 turns that off. The results
@@ -140,7 +141,7 @@ def nbody(
         invariants=kept,
         blocks=3,
         component_names=names,
-        linear_invariants=centre_of_mass(masses, shifts),
+        linear_invariants=None if _forces.has_radiating_masses(params, masses.size) else centre_of_mass(masses, shifts),
         units=units,
         source=source,
         reference=reference,
@@ -158,14 +159,20 @@ def nbody(
 
 def _variational(group: str, n: int, params: np.ndarray, parameters: Sequence[int]) -> Any:
     """Return the function of the library for `Problem.variational`; a force that is not in use has no derivatives."""
-    used = params != 0
+    used, last = params != 0, n + _forces.N_ENTRIES
+    used[last:] = used[last:].any()
     used[n + _forces.POLE : n + _forces.MOON_BODY] = used[n + _forces.POLE : n + _forces.MOON_BODY].any()
     used[n + _forces.KIND : n + 1] = used[n + _forces.MOON_BODY : n + _forces.MOON] = False
     for k in parameters:
+        if k < n < params.size and params[k] == 0 and params[last + k] != 0:
+            raise ValueError(
+                f"variations: a derivative by G m of body {k}, which is 0, while radiation acts on it: with a mass the "
+                "problem has no invariants. Give the body a small mass."
+            )
         if k >= n and not used[k]:
             raise ValueError(
-                f"variations: the parameter {ENTRIES[k - n]!r} chooses a force, or belongs to one that the problem "
-                "does not have. Choose a mass, or a constant of its forces."
+                f"variations: the parameter {(*ENTRIES, *['beta'] * n)[k - n]!r} chooses a force, or belongs to one "
+                "that the problem does not have. Choose a mass, or a constant of its forces."
             )
     return library[f"{group}.variational_by_parameters" if parameters else f"{group}.variational"]
 

@@ -67,13 +67,14 @@ def solar_system(
     Raises
     ------
     ValueError
-        If data, units or forces are unknown, "drag" is given, or "moon-quadrupole" is given for data without the
-        Earth-Moon barycentre.
+        If data, units or forces are unknown, "drag" or "radiation" is given, or "moon-quadrupole" is given for data
+        without the Earth-Moon barycentre.
     """
     known = load(data) if isinstance(data, str) else data
     chosen = check_forces(forces)
-    if "drag" in chosen:
-        raise ValueError("solar_system: the force 'drag' needs an atmosphere; see satellite(...), or nbody(...).")
+    for name, lacks in (("drag", "an atmosphere; see satellite(...), or nbody"), ("radiation", "beta; see nbody")):
+        if name in chosen:
+            raise ValueError(f"solar_system: the force {name!r} needs {lacks}.")
     if "moon-quadrupole" in chosen and "EMB" not in known.bodies:
         raise ValueError(
             f"the force 'moon-quadrupole' replaces the Moon in data that contain the Earth-Moon barycentre EMB; "

@@ -1,8 +1,9 @@
 // Derivatives of the functions of bodies by their parameters: differences of order 6, which round-off alone limits.
 //
 // All functions of three or more bodies are polynomials of degree 2 in each G m but the first, so that their differences may
-// be as long as the largest G m. The recoil of drag and the invariants of two bodies with "1pn" are not polynomials. Such a
-// function is bound to the parameters of a run, the indices of those by which it is differentiated, and their number.
+// be as long as the largest G m, and all are linear in beta. The recoil of drag and the invariants of two bodies with "1pn"
+// are not polynomials. Such a function is bound to the parameters of a run, the indices of those by which it is
+// differentiated, and their number.
 #pragma once
 
 #include <algorithm>
@@ -16,15 +17,15 @@ namespace eip {
 // The parameters of a run, and the indices of some of them. Those that do not fit count as none.
 struct BoundParameters {
     const double *params, *indices;
-    int64_t n_params, count, bodies;
+    int64_t n_params, count, bodies, linear;
 
-    // EXTRA parameters follow every G m.
+    // EXTRA parameters follow every G m and, unless there are none, every beta, in which functions are linear.
     template <int64_t EXTRA>
     static BoundParameters of(const Given<double> &g) {
         const double wanted = g.params[g.p - 1];
         const int64_t count = 0.0 <= wanted && wanted < g.p - 1 - EXTRA ? static_cast<int64_t>(wanted) : 0;
-        const int64_t n = g.p - 1 - count;
-        return {g.params, g.params + n, n, count, std::max<int64_t>(n - EXTRA, 0)};
+        const int64_t n = g.p - 1 - count, bodies = std::max<int64_t>(EXTRA > 0 ? (n - EXTRA) / 2 : n, 0);
+        return {g.params, g.params + n, n, count, bodies, bodies + EXTRA};
     }
 
     // Adds to out the derivative by parameter k of the `size` numbers that FUNCTION fills.
@@ -35,8 +36,9 @@ struct BoundParameters {
         const auto k = static_cast<int64_t>(index);
         std::vector<double> changed(params, params + n_params), value(size);
         const double own = changed[k], largest = *std::max_element(params, params + bodies);
-        const double unit = k < bodies ? largest : own != 0.0 ? std::abs(own) : 1.0;
-        const double shift = std::ldexp(1.0, std::ilogb(unit) - (0 < k && k < bodies && bodies > 2 ? 1 : 8));
+        const double unit = k < bodies ? largest : own != 0.0 && k < linear ? std::abs(own) : 1.0;
+        const bool is_long = k >= linear || (0 < k && k < bodies && bodies > 2);
+        const double shift = std::ldexp(1.0, std::ilogb(unit) - (is_long ? 1 : 8));
         for (int multiple = -3; multiple <= 3; ++multiple) {
             if (multiple == 0) continue;
             changed[k] = own + multiple * shift;

@@ -1,4 +1,4 @@
-// N bodies with further forces. After every G m the parameters hold the entries of forces.py.
+// N bodies with further forces. After every G m the parameters hold the entries of forces.py, then every beta.
 #include <algorithm>
 #include <cmath>
 
@@ -28,9 +28,13 @@ constexpr double ONE_PN = 1.0, EIH = 2.0, POTENTIAL = 3.0;
 
 struct Bodies {
     int64_t n;
-    const double *gm, *k;
+    const double *gm, *k, *beta;
 
-    explicit Bodies(const Given<double> &g) : n(g.p - N_ENTRIES), gm(g.params), k(g.params + n) {}
+    explicit Bodies(const Given<double> &g)
+        : n((g.p - N_ENTRIES) / 2),
+          gm(g.params),
+          k(g.params + n),
+          beta(k + N_ENTRIES) {}
     template <class T = double>
     Vec3<T> pole() const {
         return {k[POLE], k[POLE + 1], k[POLE + 2]};
@@ -96,7 +100,16 @@ Vec3<T> drag(const Vec3<T> &x, const Vec3<T> &v, const Bodies &b) {
     return {w * u[0], w * u[1], w * u[2]};
 }
 
-// Add to out (3 N) the Sun's further forces on all others, and their reactions on it; v is null where none depends on it.
+// Radiation pressure and Poynting-Robertson drag on body i at x with the velocity v, both relative.
+template <class T>
+Vec3<T> radiation(const Vec3<T> &x, const Vec3<T> &v, const Bodies &b, int64_t i) {
+    const T r2 = dot(x, x), r = sqrt(r2), w = b.beta[i] * b.gm[0] / r2;
+    const double over_c = std::sqrt(b.k[OVER_C2]);
+    return sum(w / r * (1.0 - over_c * dot(x, v) / r), x, -over_c * w, v);
+}
+
+// Add to out (3 N) the Sun's further forces on all others, and their reactions on it, except that of the radiation, which
+// carries momentum away; v is null where none depends on it.
 template <class T>
 void add_pulls(const T *q, const T *v, const Bodies &b, T *out) {
     Vec3<T> back{};
@@ -106,6 +119,7 @@ void add_pulls(const T *q, const T *v, const Bodies &b, T *out) {
         if (v && b.k[KIND] == ONE_PN) a = sum(1.0, a, 1.0, pull_1pn(x, body(v, i) - body(v, 0), b));
         if (v && b.k[DRAG] > 0.0) a = sum(1.0, a, 1.0, drag(x, body(v, i) - body(v, 0), b));
         add(out, i, 1.0, a);
+        if (v && b.beta[i] != 0.0) add(out, i, 1.0, radiation(x, body(v, i) - body(v, 0), b, i));
         const double share = b.gm[i] / b.gm[0];
         for (int c = 0; c < 3; ++c) back[c] += share * a[c];
     }
@@ -179,11 +193,11 @@ void energy(const Given<double> &g) {
     g.out[0] = energy_sum(g.y, b.gm, b.n) + potential(g.y, b);
 }
 
-void gradient_of_energy(const Given<double> &g) { energy_gradient(g.y, g.f, g.params, g.p - N_ENTRIES, g.out); }
+void gradient_of_energy(const Given<double> &g) { energy_gradient(g.y, g.f, g.params, Bodies(g).n, g.out); }
 
-void momentum(const Given<double> &g) { angular_momentum(g.y, g.params, g.p - N_ENTRIES, g.out); }
+void momentum(const Given<double> &g) { angular_momentum(g.y, g.params, Bodies(g).n, g.out); }
 
-void momentum_gradient(const Given<double> &g) { angular_momentum_gradient(g.y, g.params, g.p - N_ENTRIES, g.out); }
+void momentum_gradient(const Given<double> &g) { angular_momentum_gradient(g.y, g.params, Bodies(g).n, g.out); }
 
 // Along the Sun's pole.
 void axial_momentum(const Given<double> &g) {
@@ -302,20 +316,28 @@ void pair_momentum_gradient(const Given<double> &g) {
     }
 }
 
-bool with_columns(int64_t n, int64_t p) { return p > N_ENTRIES && n > 0 && n % (6 * (p - N_ENTRIES)) == 0; }
-bool of_bodies(int64_t n, int64_t p) { return p > N_ENTRIES && n == 6 * (p - N_ENTRIES); }
-bool at_positions(int64_t n, int64_t p) { return p > N_ENTRIES && n == 3 * (p - N_ENTRIES); }
+// Numbers of 6 or 3 for each body: as many, or a multiple.
+bool fits(int64_t n, int64_t p, int64_t each, bool multiple) {
+    const int64_t size = each * (p - N_ENTRIES) / 2;
+    return p > N_ENTRIES && (p - N_ENTRIES) % 2 == 0 && n > 0 && (multiple ? n % size == 0 : n == size);
+}
+bool with_columns(int64_t n, int64_t p) { return fits(n, p, 6, true); }
+bool of_bodies(int64_t n, int64_t p) { return fits(n, p, 6, false); }
+bool at_positions(int64_t n, int64_t p) { return fits(n, p, 3, false); }
 bool is_bound(int64_t n, int64_t p) { return n > 0 && p > N_ENTRIES + 2; }
-bool of_two(int64_t n, int64_t p) { return n == 12 && p == 2 + N_ENTRIES; }
+bool of_two(int64_t n, int64_t p) { return n == 12 && p == 4 + N_ENTRIES; }
 constexpr const char *COLUMNS =
-    "a state of 6 numbers per body, columns of the same size, and as parameters G m of every body and 13 entries of "
-    "the forces";
+    "a state of 6 numbers per body, columns of the same size, and as parameters G m of every body, 13 entries of the "
+    "forces, and beta of every body";
 constexpr const char *BODIES =
-    "positions and velocities, 6 numbers per body, and as parameters G m of every body and 13 entries of the forces";
+    "positions and velocities, 6 numbers per body, and as parameters G m of every body, 13 entries of the forces, and "
+    "beta of every body";
 constexpr const char *POSITIONS =
-    "positions, 3 numbers per body, and as parameters G m of every body and 13 entries of the forces";
+    "positions, 3 numbers per body, and as parameters G m of every body, 13 entries of the forces, and beta of every "
+    "body";
 constexpr const char *BOUND = "a state of bodies, and to be bound to parameters, the indices of some, and their number";
-constexpr const char *TWO = "a state of 12 numbers, and as parameters G m of both bodies and 13 entries of the forces";
+constexpr const char *TWO =
+    "a state of 12 numbers, and as parameters G m of both bodies, 13 entries of the forces, and beta of both";
 
 #define EIP_FORCES(name, function, value, numbers, fits, sizes) \
     {name, Value::value, numbers, plain<double, function>, nullptr, fits, sizes}
