@@ -10,8 +10,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain
-from typing import Any
+from itertools import chain, pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,8 @@ __all__ = ["Examiner", "is_check_due", "steps_to_check", "unresolved"]
 POINTS = 8
 # Number of points in each earlier step that was not projected.
 BACK = 4
+# Halvings of a part of a step that leave of a change only a jump, of at least this share of it, and no rounding.
+HALVINGS, JUMP, BEYOND_ROUNDING = 40, 0.1, 1e3 * data.EPS
 # Factor by which the largest correction has to grow before a large correction is examined again.
 GROWTH = 2.0
 # Consecutive steps that are compared, each with SUBSTEPS of DOP853. At most one of them passes a kink, so the step with
@@ -132,7 +134,47 @@ class Examiner:
         shares = np.arange(1, POINTS + 1) / POINTS
         chord = ((t_old + float(share) * (t_new - t_old), old + share * (new - old)) for share in shares)
         states = chain(chord, _before(self.invariants.t_span[0], rhs, t_old, old, t_new - t_old, waited))
-        return next(filter(None, (self._finding(rhs, t, y) for t, y in states)), None)
+        found = next(filter(None, (self._finding(rhs, t, y) for t, y in states)), None)
+        return found or self._jump(rhs, lambda share: (t_old + share * (t_new - t_old), old + share * (new - old)))
+
+    def _jump(self, rhs: Derivative, chord: Callable[[float], tuple[float, Array]]) -> str | None:
+        """Return a sentence if the invariant with the largest correction jumps on a step's chord, or None.
+
+        Its rate is 0 on both sides of a jump. Where it changes most beside its gradient, a part of the chord is halved
+        until only a jump can be left.
+        """
+        k, kept = int(self.figures[:, data.NU].argmax()), self.invariants
+
+        def point(share: float) -> Point:
+            t, y = chord(share)
+            return Point(share, t, y, float(kept.values(t, y)[k]), kept.gradients(t, y, rhs(t, y))[k])
+
+        for left, right in pairwise(map(point, np.linspace(0.0, 1.0, POINTS + 1).tolist())):
+            least = max(JUMP * _change((left, right)), BEYOND_ROUNDING * self.figures[k, data.TERMS])
+            for _ in range(HALVINGS):
+                middle = point((left.share + right.share) / 2)
+                left, right = max((left, middle), (middle, right), key=_change)
+            if (jump := _change((left, right))) > least:
+                where = f"{kept.names[k]!r} jumps by {jump:.2g} at t={left.t:.6g}, so that it is not an invariant there"
+                return f"{where}; make it continuous, for instance by a shift of a potential that is cut off"
+        return None
+
+
+class Point(NamedTuple):
+    """A state on the chord of a step, with the value and the gradient of an invariant."""
+
+    share: float
+    t: float
+    y: Array
+    value: float
+    gradient: Array
+
+
+def _change(ends: tuple[Point, Point]) -> float:
+    """Return by how much the value changes between two points, beside what the gradients there explain."""
+    one, two = ends
+    explained = np.vdot(one.gradient + two.gradient, two.y - one.y).real / 2
+    return abs(two.value - one.value - float(explained))
 
 
 def _before(begin: float, rhs: Derivative, t: float, y: Array, h: float, steps: int) -> Iterator[tuple[float, Array]]:

@@ -352,7 +352,7 @@ class Run:
         free.start_at(y, check=False, is_known=True)
         free.work.K[0], free.schedule = free.start.f, bare_schedule(stepping.span, free.start.tau)
         free.schedule.place[PENDING] = 1  # steps are made one by one
-        engine, here = free.engine(problem.in_python(free)), (OK, t, y, free.start.f)
+        engine, here = free.engine(problem.in_python(free)._replace(event=())), (OK, t, y, free.start.f)
         for k in range(FREE_STEPS):
             if here[0] == OK:
                 here = engine.step(k, *here[1:])

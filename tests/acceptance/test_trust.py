@@ -256,6 +256,17 @@ def test_kinks_are_no_leaks(kind, size):
             assert run.trusted, run.message
 
 
+@pytest.mark.parametrize("options", [{"method": EIPRK4, "h": 0.01}, {"method": EIPDOP853, "rtol": 1e-9, "atol": 1e-9}])
+@pytest.mark.parametrize("driver", [integrate, ensemble])
+def test_an_energy_that_jumps_where_a_potential_is_cut_off(driver, options):
+    """Its rate is 0 on both sides, and the projection moves the jump into the motion."""
+    jumps = Invariant(lambda t, y: 0.5 * float(y @ y) + 1e-4 * (y[0] > 1), lambda t, y: y, name="E")
+    start = REST if driver is integrate else [REST]
+    with pytest.warns(ProjectionWarning, match="'E' jumps by 0.0001 at t=" if driver is integrate else "E"):
+        run = driver(systems.oscillator, (0, 20), start, invariants=jumps, **options)
+    assert not np.any(run.trusted)
+
+
 def test_close_to_a_pericentre_a_right_gradient_is_right():
     for e in (0.9, 1 - 1e-3, 1 - 1e-6, 1 - 1e-9):
         steps = {"method": EIPDOP853, "h": None, "first_step": 1e-12, "rtol": 1e-10, "compiled": False}
@@ -396,6 +407,7 @@ def test_a_wrong_invariant_does_not_make_a_run_crawl(driver):
     fun, y0 = lambda t, y: -1j * (A @ y) - loss * y, np.ones(3, complex) / 3**0.5
     norm = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="norm")
     options = {"method": EIPDOP853, "rtol": 1e-8, "atol": 1e-8, "invariants": norm}
+    options["events"] = lambda t, y: y[0].real - 5
     if driver == "ensemble":
         run = ensemble(fun, (0, 20), [y0], **options)
         status, message, nfev = run.status[0], run.message[0], run.nfev[0]
