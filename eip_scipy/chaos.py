@@ -63,6 +63,10 @@ class ChaosResult(OptimizeResult):
         Whether an orbit is reliable, as for `integrate`, and the reason for its end.
     success : bool
         True if no orbit failed.
+
+    See Also
+    --------
+    lyapunov_exponent, lyapunov_spectrum, megno
     """
 
     def plot(self) -> Any:
@@ -234,7 +238,20 @@ def _orthonormal(n: int, k: int) -> Array:
 
 
 def lyapunov_exponent(fun: Any, t: Any = None, y0s: Any = None, **options: Any) -> ChaosResult:
-    """Compute the largest Lyapunov exponents of many orbits: `lyapunov_spectrum` with ``count=1``."""
+    """Compute the largest Lyapunov exponents of many orbits: `lyapunov_spectrum` with ``count=1``.
+
+    See Also
+    --------
+    lyapunov_spectrum, megno, eip_scipy.plotting.map
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, hamiltonian
+    >>> from eip_scipy.chaos import lyapunov_exponent
+    >>> pendulum = hamiltonian("p**2/2 - cos(q)")
+    >>> lyapunov_exponent(pendulum, 1000, [[0.0, 1.0], [0.5, 1.0]], method=EIPDOP853, h=0.1).lyapunov < 0.02
+    array([ True,  True])
+    """
     return lyapunov_spectrum(fun, t, y0s, count=1, **options)
 
 
@@ -278,6 +295,10 @@ def lyapunov_spectrum(
     TypeError, ValueError
         If an argument is wrong, as for `ensemble`. An exception or interruption has the orbits so far as ``partial``.
 
+    See Also
+    --------
+    lyapunov_exponent, megno
+
     Notes
     -----
     The estimates converge as 1/t, with fluctuations, which ``running`` shows. In a backward run the exponents are those
@@ -286,7 +307,8 @@ def lyapunov_spectrum(
 
     References
     ----------
-    .. [1] G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980), 9-20 and 21-30.
+    .. [1] G. Benettin, L. Galgani, A. Giorgilli, J.-M. Strelcyn, Meccanica 15 (1980), 9-20 and 21-30,
+       doi:10.1007/BF02128236.
 
     Examples
     --------
@@ -338,6 +360,10 @@ def megno(
     -------
     ChaosResult
 
+    See Also
+    --------
+    lyapunov_exponent, eip_scipy.plotting.map
+
     Notes
     -----
     With the tangent vector d, ``Y(t) = (2/t) int_0^t s (d' . d)/(d . d) ds = 2 (L(t) - (1/t) int_0^t L ds)``, where
@@ -347,8 +373,9 @@ def megno(
 
     References
     ----------
-    .. [1] P. M. Cincotta, C. Simó, Astron. Astrophys. Suppl. Ser. 147 (2000), 205-228, eqs. 23 to 25.
-    .. [2] H. Rein, D. Tamayo, MNRAS 459 (2016), 2275-2285, section 4.
+    .. [1] P. M. Cincotta, C. Simó, Astron. Astrophys. Suppl. Ser. 147 (2000), 205-228, eqs. 23 to 25,
+       doi:10.1051/aas:2000108.
+    .. [2] H. Rein, D. Tamayo, MNRAS 459 (2016), 2275-2285, section 4, doi:10.1093/mnras/stw644.
 
     Examples
     --------

@@ -47,7 +47,12 @@ NO_RIGHT = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class CheckpointError(Exception):
-    """Error for a checkpoint that cannot be written or read, is damaged, or belongs to another run."""
+    """Error for a checkpoint that cannot be written or read, is damaged, or belongs to another run.
+
+    See Also
+    --------
+    read, write
+    """
 
 
 def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -71,6 +76,10 @@ def write(path: str | os.PathLike[str], header: Mapping[str, Any], arrays: Mappi
     ------
     CheckpointError
         If the file cannot be written, for instance because the disk is full.
+
+    See Also
+    --------
+    read, eip_scipy.results.save
 
     Examples
     --------
@@ -132,6 +141,21 @@ def read(path: str | os.PathLike[str], kind: str | None = None) -> tuple[dict[st
     ------
     CheckpointError
         If the file cannot be read, is not a checkpoint, is damaged or truncated, or has another schema or kind.
+
+    See Also
+    --------
+    write, eip_scipy.load
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from eip_scipy import EIPRK4, checkpoint, integrate
+    >>> from eip_scipy.problems import kepler
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     run = integrate(kepler(), (0, 30), method=EIPRK4, checkpoint=f"{folder}/run.npz")
+    ...     header, arrays = checkpoint.read(f"{folder}/run.npz")
+    >>> header["kind"]
+    'integrate'
     """
     try:
         with open(path, "rb") as stream:
@@ -160,6 +184,10 @@ def require_same(path: str | os.PathLike[str], there: Any, here: Mapping[str, An
     ------
     CheckpointError
         If settings differ; the message names each of them, with both values if they are short.
+
+    See Also
+    --------
+    read, write
     """
     here, there = json.loads(json.dumps(here)), there if isinstance(there, dict) else {}
     differences = []
@@ -204,6 +232,10 @@ def warn_of_other_versions(path: str | os.PathLike[str], header: Mapping[str, An
     """Warn if a checkpoint was written by other versions of the packages, or on another kind of machine.
 
     The last bits of the results may then differ from those of an uninterrupted run.
+
+    See Also
+    --------
+    read, write
     """
     there = {**(header.get("versions") or {}), "machine": header.get("machine")}
     here = {**_versions(), "machine": _machine()}

@@ -52,6 +52,10 @@ class Balance(Invariant):
         ``rate(t, y, f, *args)`` and ``grad(t, y, f, *args)``, if they are given, also receive f, the derivative of the
         state.
 
+    See Also
+    --------
+    Invariant, integrate, eip_scipy.problems.orbital_balances
+
     Notes
     -----
     Balances need a Runge-Kutta method (`EIPRK1` to `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, or one that

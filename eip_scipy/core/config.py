@@ -52,6 +52,10 @@ def show_config(mode: str = "stdout") -> dict[str, Any] | None:
     ValueError
         If the mode is unknown.
 
+    See Also
+    --------
+    numpy.show_config, scipy.show_config
+
     Notes
     -----
     ``eip-scipy doctor`` shows the same report and runs a test that takes some seconds.

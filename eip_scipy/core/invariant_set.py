@@ -490,6 +490,17 @@ def check_gradient(invariant: Invariant, t: float, y: Any, fun: Callable[..., An
     ------
     ValueError
         If the gradient has the wrong shape, or `fun` is missing for an invariant with ``uses_f=True``.
+
+    See Also
+    --------
+    Invariant, find_invariants
+
+    Examples
+    --------
+    >>> from eip_scipy import Invariant, check_gradient
+    >>> wrong = Invariant(lambda t, y: y[0] ** 2 + y[1] ** 2, grad=lambda t, y: [2 * y[0], y[1]])
+    >>> round(check_gradient(wrong, 0.0, [3.0, 4.0]), 2)
+    0.89
     """
     y = states("y", y)
     if invariant.uses_f and fun is None:

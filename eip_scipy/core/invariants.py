@@ -73,6 +73,10 @@ class Invariant:
         ``grad(t, y, f, *args)`` also receives the derivative f = fun(t, y) of the system, which the step has often
         evaluated already.
 
+    See Also
+    --------
+    Balance, check_gradient, find_invariants, particle_invariants
+
     Notes
     -----
     Every Runge-Kutta method keeps linear invariants. Do not list them as invariants. `integrate` finds them in compiled

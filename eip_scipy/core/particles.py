@@ -55,6 +55,10 @@ def particle_invariants(masses: Any, dimension: int = 3, *, about: Any = None) -
     ValueError
         If a mass is negative or not finite, all are 0, or `dimension` or `about` are wrong.
 
+    See Also
+    --------
+    find_invariants, Invariant, eip_scipy.problems.nbody
+
     Notes
     -----
     The functions are jitted if those of the run are. They accept the ``params`` of a run and do not use them.

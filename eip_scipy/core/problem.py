@@ -111,6 +111,19 @@ class Problem:
     events : callable or sequence of callable, optional
         Events that `integrate`, `ensemble` and `solve_ivp` use if their argument `events` is not given; with
         ``events=()`` they use none.
+
+    See Also
+    --------
+    eip_scipy.integrate, eip_scipy.hamiltonian, nbody, mechanism
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPDOP853
+    >>> from eip_scipy.problems import Problem
+    >>> turning, square = lambda t, y: np.array([y[1], -y[0]]), lambda t, y: y @ y
+    >>> Problem("turning", turning, np.array([1.0, 0.0]), (0, 9), square).solve_ivp(method=EIPDOP853).success
+    True
     """
 
     name: str

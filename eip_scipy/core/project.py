@@ -75,6 +75,10 @@ def project(
     ProjectionWarning
         If an error of more than 1 % of the terms of an invariant remains.
 
+    See Also
+    --------
+    Invariant, integrate, eip_scipy.results.ProjectionResult
+
     Notes
     -----
     The correction is y - y_hat = sigma * x, shifted along S with linear invariants, where x has the smallest 2-norm

@@ -27,6 +27,20 @@ class Diagnostics:
         Largest invariant error ``|I - target|`` after a projection, in the unit of each invariant.
     moved : str
         How far ``project_initial=True`` moved y0; "" if it did not.
+
+    See Also
+    --------
+    integrate, solve_ivp, ProjectionWarning
+
+    Examples
+    --------
+    >>> from scipy.integrate import solve_ivp
+    >>> from eip_scipy import EIPRK45, Diagnostics
+    >>> record = Diagnostics()
+    >>> options = {"rtol": 1e-8, "atol": 1e-8, "invariants": lambda t, y: y @ y, "diagnostics": record}
+    >>> sol = solve_ivp(lambda t, y: [y[1], -y[0]], (0, 9), [1, 0], method=EIPRK45, **options)
+    >>> record.trusted, bool(record.max_residual[0] < 1e-13)
+    (True, True)
     """
 
     def __init__(self) -> None:
@@ -212,6 +226,10 @@ class Multipliers(NamedTuple):
     rank : int or ndarray of int, shape (k,)
         Rank of the constraints. Where it is below m, forces are distributed over dependent constraints such that the
         sum of the squares of ``lambda_i |G_i|`` is least.
+
+    See Also
+    --------
+    eip_scipy.problems.mechanism
     """
 
     names: tuple[str, ...]
@@ -237,6 +255,10 @@ class ProjectionResult(NamedTuple):
         Rank of the gradients: l if all invariants are independent; 0 if no correction was necessary.
     correction : ndarray, shape (n,)
         y - y_hat.
+
+    See Also
+    --------
+    eip_scipy.project
     """
 
     y: Any

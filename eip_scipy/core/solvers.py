@@ -68,6 +68,39 @@ class SolverClass(type):
     """Metaclass of the solver classes. It makes the classes that `eip_method` returns picklable."""
 
 
+# What the docstring of each method ends with; the example is left out where there is another one.
+SEE = """
+    See Also
+    --------
+    eip_scipy.solvers.EIPSolver, eip_scipy.solve_ivp, eip_scipy.integrate, eip_scipy.recommend
+
+    References
+    ----------
+    .. [1] {reference}.
+"""
+EXAMPLE = """
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import {name}, solve_ivp
+    >>> turning, square = lambda t, y: np.append(y[2:], -y[:2]), lambda t, y: y @ y
+    >>> sol = solve_ivp(turning, (0, 9), [1, 0, 0, 1], method={name}, h=0.02, invariants=square)
+    >>> sol.trusted, bool(abs(square(9, sol.y[:, -1]) - 2) < 1e-6)
+    (True, True)
+"""
+
+
+def _with_facts(name: str, text: str, method: Method) -> str:
+    """Return the docstring of a method with its order, stages, estimate and source, and with an example."""
+    first, _, rest = text.rstrip().partition("\n")
+    stages = f", {method.n_stages} stages" if hasattr(method, "n_stages") else ""
+    order = "Orders 1 to 5" if method is BDF else f"Order {method.order}"
+    estimate = f"an error estimate of order {'1 to 5' if method is BDF else method.error_estimator_order}"
+    facts = f"{order}{stages}, {estimate if method.has_estimate else 'no error estimate'} [1]_."
+    example = "" if "Examples\n" in rest else EXAMPLE.format(name=name)
+    return f"{first}\n\n    {facts}\n{rest}\n{SEE.format(reference=method.reference)}{example}    "
+
+
 @takes_projection_options
 class EIPSolver(OdeSolver, metaclass=SolverClass):
     """Explicit invariants-preserving solver: a Runge-Kutta step, then one Newton step of projection.
@@ -218,6 +251,8 @@ class EIPSolver(OdeSolver, metaclass=SolverClass):
         """Give a subclass the attributes of SciPy's RungeKutta classes: order, n_stages, A, B, C, E, P ..."""
         super().__init_subclass__(**keywords)
         if "TABLEAU" in vars(cls):
+            if cls.__name__ in __all__:
+                cls.__doc__ = _with_facts(cls.__name__, cls.__doc__ or "", cls.TABLEAU)
             found = dict.fromkeys(ATTRIBUTES, NotImplemented) | cls.TABLEAU.class_attributes()
             if cls._SCIPY is not None:
                 found = {name: getattr(cls._SCIPY, name, NotImplemented) for name in ATTRIBUTES}
@@ -707,6 +742,15 @@ class EIPBDF(_Implicit):
     """EIP method on the steps of SciPy's BDF, of variable order up to 5, for stiff systems and loose tolerances.
 
     Options and notes: see `EIPRadau`; complex states are possible.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPBDF, solve_ivp
+    >>> decay = lambda t, y: np.array([-1e4 * y[0] + y[1], 1e4 * y[0] - y[1]])
+    >>> sol = solve_ivp(decay, (0, 10), [1, 0], method=EIPBDF, invariants=lambda t, y: y.sum())
+    >>> sol.trusted, bool(abs(sol.y.sum(axis=0) - 1).max() < 1e-14)
+    (True, True)
     """
 
     TABLEAU = BDF
@@ -749,6 +793,10 @@ def eip_method(method: Tableau | NystromTableau | GaussJackson | OneStepMethod |
         If `method` is none of these, or a class whose steps do not follow from its coefficients.
     ValueError
         If the order of a one-step method is not an integer >= 1, or coefficients of a class miss an order condition.
+
+    See Also
+    --------
+    solve_ivp, integrate, eip_scipy.methods.Tableau, eip_scipy.solvers.OneStepMethod
 
     Examples
     --------

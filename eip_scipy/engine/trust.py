@@ -42,6 +42,17 @@ class ProjectionWarning(RuntimeWarning):
     of the result or its diagnostics is then False, and ``message`` gives the reason. `project` issues it if a large
     error remains, and `recommend` if it recommends a run without invariants. The page "When a run is not trusted"
     explains what to do.
+
+    See Also
+    --------
+    Diagnostics, check_gradient
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from eip_scipy import ProjectionWarning
+    >>> warnings.simplefilter("error", ProjectionWarning)  # a faulty run is then an error
+    >>> warnings.simplefilter("default", ProjectionWarning)
     """
 
 

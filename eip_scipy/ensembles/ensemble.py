@@ -173,6 +173,10 @@ def ensemble(
         If `checkpoint` exists without ``resume=True``, is damaged, belongs to other arguments or functions, or is used
         by another ensemble.
 
+    See Also
+    --------
+    integrate, eip_scipy.results.EnsembleResult
+
     Notes
     -----
     Members run in chunks, which are collected in order. If the ensemble is interrupted (Ctrl-C, or an exception raised

@@ -110,6 +110,10 @@ class EnsembleResult(Result):
         As in `IntegrationResult`.
     chunk : int
         Number of members in a chunk.
+
+    See Also
+    --------
+    eip_scipy.ensemble, IntegrationResult
     """
 
     COMPONENTS = 1

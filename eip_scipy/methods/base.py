@@ -41,6 +41,7 @@ class Method:
     name: str
     order: int
     error_estimator_order: int | None
+    reference: str = ""  # the source of the method
     # True if the equations are q'' = a(t, q), and the state is (q, v).
     of_second_order: ClassVar[bool] = False
     # True if steps use results of earlier steps. Such a method starts once and uses compensated sums, and its history

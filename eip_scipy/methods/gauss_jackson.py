@@ -97,7 +97,7 @@ class GaussJackson(Method):
     ----------
     .. [1] P. Henrici, "Discrete Variable Methods in Ordinary Differential Equations", 1962, chapters 5 and 6.
     .. [2] M. M. Berry, L. M. Healy, "Implementation of Gauss-Jackson integration for orbit propagation", J. Astronaut.
-       Sci. 52 (2004) 331.
+       Sci. 52 (2004) 331, doi:10.1007/BF03546367.
     """
 
     of_second_order = has_history = True
@@ -108,6 +108,9 @@ class GaussJackson(Method):
     name: str = ""
     velocities: bool = False
     error_estimator_order: int = field(init=False)
+    reference: str = field(
+        init=False, default="Berry & Healy, J. Astronaut. Sci. 52 (2004) 331, doi:10.1007/BF03546367"
+    )
 
     def __post_init__(self) -> None:
         order = self.order

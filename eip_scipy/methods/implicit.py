@@ -228,6 +228,7 @@ class _Radau(ScipySolverAdapter):
     """
 
     solver, order, error_estimator_order, takes_complex = scipy.integrate.Radau, 5, 3, False
+    reference = "Hairer & Wanner, Solving ODEs II, section IV.8, doi:10.1007/978-3-642-05221-7; SciPy's Radau"
     # Coefficients of x, x^2 and x^3, in terms of Radau's stages, of the polynomial through 0 and the stages.
     polynomials = np.linalg.inv(NODES[:, None] ** np.arange(1, 4))
     _solved: Array
@@ -263,6 +264,7 @@ class _BDF(ScipySolverAdapter):
     """
 
     solver, order, error_estimator_order, takes_complex = scipy.integrate.BDF, 1, 1, True
+    reference = "Shampine & Reichelt, SIAM J. Sci. Comput. 18 (1997) 1, doi:10.1137/S1064827594276424; SciPy's BDF"
     polynomials = np.eye(MOST_ORDER)
 
     def _kept(self) -> dict[str, Any]:

@@ -439,8 +439,8 @@ RKN86 = _Published(
     """,
     order=8,
     error_estimator_order=6,
-    reference="Dormand, El-Mikkawy & Prince, IMA J. Numer. Anal. 7 (1987) 423, table 1, RKN8(6)9FM; corrigendum: "
-    "IMA J. Numer. Anal. 11 (1991) 297",
+    reference="Dormand, El-Mikkawy & Prince, IMA J. Numer. Anal. 7 (1987) 423, doi:10.1093/imanum/7.4.423, "
+    "table 1, RKN8(6)9FM; corrigendum: IMA J. Numer. Anal. 11 (1991) 297",
 )
 # The paper offers these numbers on request only. Some of the longest integers are truncated in the available copies:
 # with ...125 as the last digits of the numerator of A[13, 5] the conditions on that row hold exactly. All order
@@ -553,6 +553,7 @@ RKN1210 = _Published(
     """,
     order=12,
     error_estimator_order=10,
-    reference="Dormand, El-Mikkawy & Prince, IMA J. Numer. Anal. 7 (1987) 423, RKN12(10), 17 stages; fractions: "
-    "Brankin, Gladwell, Dormand, Prince & Seward, ACM Trans. Math. Softw. 15 (1989) 31 (Algorithm 670)",
+    reference="Dormand, El-Mikkawy & Prince, IMA J. Numer. Anal. 7 (1987) 423, doi:10.1093/imanum/7.4.423, "
+    "RKN12(10), 17 stages; fractions: Brankin, Gladwell, Dormand, Prince & Seward, ACM Trans. Math. Softw. 15 (1989) "
+    "31 (Algorithm 670)",
 )

@@ -455,7 +455,7 @@ class _DOP853(Published, Tableau):
             b_hat=[x - Fraction(float(e)) for x, e in zip([*b, Fraction(0)], source.E5, strict=True)],
             error_estimator_order=7,
             e_low=[float(x) for x in source.E3],
-            reference="Hairer, Norsett & Wanner, Solving ODEs I, section II.10 (DOP853)",
+            reference="Hairer, Norsett & Wanner, Solving ODEs I, section II.10 (DOP853), doi:10.1007/978-3-540-78862-1",
         )
 
     def dense_form(self, stepper: Any) -> DenseForm:
@@ -495,12 +495,15 @@ RK5 = _Published(
         16/135 0 6656/12825 28561/56430 -9/50 2/55;
         25/216 0 1408/2565 2197/4104 -1/5 0
     """,
-    5, 4, reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1",
+    5, 4,
+    reference="Fehlberg's 4(5) pair: Hairer, Norsett & Wanner, Solving ODEs I, table II.5.1, doi:10.1007/978-3-540-"
+    "78862-1",
 )  # fmt: skip
 RK23 = _Published(
     "RK23", "; 1/2; 0 3/4; 2/9 1/3 4/9; 7/24 1/4 1/3 1/8", 3, 2,
     P=read("1 -4/3 5/9; 0 1 -2/3; 0 4/3 -8/9; 0 -1 1"),
-    reference="Bogacki & Shampine, Appl. Math. Lett. 2 (1989) 321; interpolant: cubic Hermite",
+    reference="Bogacki & Shampine, Appl. Math. Lett. 2 (1989) 321, doi:10.1016/0893-9659(89)90079-7; interpolant: "
+    "cubic Hermite",
 )  # fmt: skip
 RK45 = _Published(
     "RK45",
@@ -519,6 +522,7 @@ RK45 = _Published(
         0 -282668133/205662961 2019193451/616988883 -1453857185/822651844;
         0 40617522/29380423 -110615467/29380423 69997945/29380423
     """),
-    reference="Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19; interpolant: Shampine, Math. Comp. 46 (1986) 135",
+    reference="Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19, doi:10.1016/0771-050X(80)90013-3; interpolant: "
+    "Shampine, Math. Comp. 46 (1986) 135",
 )  # fmt: skip
 DOP853 = _DOP853()

@@ -121,6 +121,16 @@ def map(
     ------
     ValueError
         If the shapes do not agree, or `most` is not above 0.
+
+    See Also
+    --------
+    eip_scipy.chaos.megno, eip_scipy.chaos.lyapunov_exponent
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy.plotting import map
+    >>> figure = map([1.0, 1.1, 1.2], [0.0, 0.1], np.full((2, 3), 2.0), xlabel="axis", ylabel="eccentricity")
     """
     known = isinstance(found, Mapping)
     is_megno = not known or "megno" in found

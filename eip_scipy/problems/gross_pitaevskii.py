@@ -52,6 +52,10 @@ class Grid:
     cell : float
         Length, area or volume of a cell, which belongs to one point; h_x h_y in two dimensions.
 
+    See Also
+    --------
+    GrossPitaevskii
+
     Examples
     --------
     >>> from eip_scipy.problems import Grid
@@ -227,7 +231,20 @@ class SpectralSum:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FieldProblem(Problem):
-    """A `Problem` whose state is a field on the grid of its `equation`; ``equation.grid.field(y)`` shapes states."""
+    """A `Problem` whose state is a field on the grid of its `equation`; ``equation.grid.field(y)`` shapes states.
+
+    See Also
+    --------
+    GrossPitaevskii, Problem
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy.problems import Grid, GrossPitaevskii
+    >>> problem = GrossPitaevskii(Grid((32,), -8, 8), lambda x: x**2 / 2).problem(np.ones(32) / 4, 1.0)
+    >>> problem.equation.grid.field(problem.y0).shape
+    (32,)
+    """
 
     equation: GrossPitaevskii = None  # type: ignore[assignment]  # always given
 
@@ -266,6 +283,10 @@ class GrossPitaevskii:
     ------
     ValueError
         If a value is wrong, the potential is complex, not finite or of a wrong shape, or `Omega` is not 0 in 1D.
+
+    See Also
+    --------
+    Grid, FieldProblem
 
     Notes
     -----

@@ -94,6 +94,10 @@ def find_invariants(
         If an argument is wrong, `fun` is not finite at (t, y0), `fun` or a term is finite at too few points, or the
         gradient of a term differs from its differences.
 
+    See Also
+    --------
+    Invariant, particle_invariants, recommend
+
     Notes
     -----
     Quantities that are conserved on a manifold only (for example of unit quaternions) are not found. A quantity whose

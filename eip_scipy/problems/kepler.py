@@ -37,6 +37,25 @@ def kepler(eccentricity: float = 0.6, relativistic: float = 0.005, t_end: float 
     ------
     ValueError
         If the eccentricity is not in [0, 1).
+
+    See Also
+    --------
+    harmonic, nbody, time_transformed
+
+    References
+    ----------
+    .. [1] W. Cai, Y. Gong, Y. Wang, "An explicit and practically invariants-preserving method for conservative
+       systems".
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPDOP853, integrate
+    >>> from eip_scipy.problems import kepler
+    >>> problem = kepler(0.6, relativistic=0, t_end=20)
+    >>> run = integrate(problem, method=EIPDOP853, h=None, rtol=1e-11, atol=1e-11)
+    >>> bool(np.abs(run.y[:, -1] - problem.reference(20)).max() < 1e-7)
+    True
     """
     e = float(eccentricity)
     if not 0 <= e < 1:
@@ -86,6 +105,17 @@ def harmonic(omega: float = 10.0, y0: Any = (1.0, 0.0), t_end: float = 1.0, h: f
     -------
     Problem
         With the closed form as `reference`.
+
+    See Also
+    --------
+    kepler, eip_scipy.hamiltonian
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import harmonic
+    >>> integrate(harmonic(), method=EIPRK4).trusted
+    True
     """
     start = real_array("y0", y0)
     params = np.array([omega], dtype=float)

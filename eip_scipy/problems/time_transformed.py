@@ -22,7 +22,12 @@ __all__ = ["centre_time", "pair_time", "reaches", "time_transformed"]
 
 @compilable
 def centre_time(y, params):
-    """Return the time scale r^(3/2) of motion around one centre with G M = 1, which is the function g for `kepler`."""
+    """Return the time scale r^(3/2) of motion around one centre with G M = 1, which is the function g for `kepler`.
+
+    See Also
+    --------
+    time_transformed, pair_time, reaches
+    """
     r2 = 0.0
     for k in range(y.size // 2):
         r2 += y[k] * y[k]
@@ -35,6 +40,10 @@ def pair_time(y, params):
     """Return (sum over pairs of (Gm_i + Gm_j) / r^3)^(-1/2), a smooth time scale of the closest pair of N bodies.
 
     `y` holds the N positions and the N velocities in space, and `params` begins with the N values Gm_i.
+
+    See Also
+    --------
+    time_transformed, centre_time, reaches
     """
     rate2 = 0.0
     for i in range(y.size // 6):
@@ -46,7 +55,12 @@ def pair_time(y, params):
 
 
 def reaches(t: float) -> Callable[..., float]:
-    """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t)."""
+    """Return a terminal event that ends a run of a transformed problem at the time `t` (not at s = t).
+
+    See Also
+    --------
+    time_transformed, pair_time, centre_time
+    """
     t = float(t)
     event = jitted(compilable(lambda s, y, params: y[-1] - t))
     event.terminal = True
@@ -78,6 +92,19 @@ def time_transformed(problem: Problem, s_end: float, g: Callable[..., Any] = pai
     ------
     ValueError
         If the problem has no compiled right-hand side, or one of its invariants is a `Balance` or depends on t.
+
+    See Also
+    --------
+    pair_time, centre_time, reaches, pythagorean
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPDOP853, integrate
+    >>> from eip_scipy.problems import pythagorean, reaches, time_transformed
+    >>> near = time_transformed(pythagorean(), 1e4)
+    >>> run = integrate(near, method=EIPDOP853, rtol=1e-12, atol=1e-12, events=reaches(16.0))
+    >>> round(float(run.y[-1, -1]), 6)
+    16.0
     """
     if problem.rhs is None:
         raise ValueError(

@@ -300,6 +300,10 @@ def to_xarray(result: Any, names: Any = None) -> Dataset:
     ValueError
         If the number of names differs from the number of components, or two names are equal.
 
+    See Also
+    --------
+    to_dataframe, save
+
     Examples
     --------
     >>> from eip_scipy import EIPRK4, integrate
@@ -349,6 +353,10 @@ def to_dataframe(result: Any, names: Any = None) -> DataFrame:
         If pandas is missing: ``pip install "eip_scipy[pandas]"``.
     ValueError
         As for `to_xarray`.
+
+    See Also
+    --------
+    to_xarray, save
 
     Examples
     --------

@@ -83,7 +83,16 @@ def integrate(
 ) -> IntegrationResult:
     """Integrate with fixed or adaptive steps, compiled if the functions are Numba functions.
 
-    The solver classes take the same steps. Results agree to rounding, whether the functions are compiled or not.
+    The solver classes take the same steps. Results agree to rounding, whether the functions are compiled or not. The
+    parameters below come in groups:
+
+    - the problem: `fun` to `jac`;
+    - the method and its steps: `method`, `h`, `rtol`, `atol`, `first_step`, `max_step`, `max_steps`;
+    - the invariants and their projection: `invariants` and the options after it;
+    - derivatives of the solution: `variations`, `jvp`, `symplectic`;
+    - what is saved, and events: `save_every` to `events`;
+    - the course of the run: `callback`, `progress`, `compiled`, `max_bytes`;
+    - checkpoints: `checkpoint` to `resume`.
 
     Parameters
     ----------
@@ -94,22 +103,14 @@ def integrate(
         :doc:`/tutorials/compiled-functions`. With a Nystrom method (`EIPRKN8`, `EIPRKN12`) or a multistep one
         (`EIPGJ12`, `EIPGJ14`), whose state is (q, v), ``fun`` must return (v, a); give `acceleration` instead to
         write only a. A `Problem` contains everything else; options given here take precedence.
+    acceleration : callable, optional
+        Instead of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
+        (n/2,)``, and otherwise as `fun`. Accelerations that depend on velocities belong in `fun`.
     t_span : (float, float)
         Start and end; time runs backward if the end is before the start. `eip_scipy.integrations.astropy` converts
         quantities and dates.
     y0 : array_like, shape (n,)
         Initial state, real or complex.
-    acceleration : callable, optional
-        Instead of `fun`, for q'' = a(t, q) with the state (q, v) and any method: ``acceleration(t, q[, params]) ->
-        (n/2,)``, and otherwise as `fun`. Accelerations that depend on velocities belong in `fun`.
-    method : type, optional
-        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
-        `EIPRadau`, `EIPBDF`, or a class made by `eip_method`. `EIPRadau`, `EIPBDF` and classes made from a one-step
-        method run interpreted. Default: the method of the problem, if it has one.
-    h : float, optional
-        Length of the steps, > 0; the last step ends at the end of `t_span` and may be shorter. None: adaptive steps
-        controlled by `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive if one of these is given, else the
-        step of the problem, if it has one.
     args : tuple, optional
         As in `scipy.integrate.solve_ivp`: passed on as the last arguments, to `fun`, events, `jacobian` and `jac`, and
         to the invariants' functions behind their own. Numbers reach Numba functions as such (a float, an int, a bool)
@@ -126,6 +127,24 @@ def integrate(
     jac : callable or array_like, shape (n, n), optional
         For `EIPRadau` and `EIPBDF`, as for SciPy's Radau and BDF: ``jac(t, y[, params]) -> (n, n)``, the matrix of the
         derivatives of `fun`, dense or sparse, or a constant matrix.
+    method : type, optional
+        `EIPRK1` ... `EIPRK5`, `EIPRK23`, `EIPRK45`, `EIPDOP853`, `EIPRKN8`, `EIPRKN12`, `EIPGJ12`, `EIPGJ14`,
+        `EIPRadau`, `EIPBDF`, or a class made by `eip_method`. `EIPRadau`, `EIPBDF` and classes made from a one-step
+        method run interpreted. Default: the method of the problem, if it has one.
+    h : float, optional
+        Length of the steps, > 0; the last step ends at the end of `t_span` and may be shorter. None: adaptive steps
+        controlled by `rtol`, `atol`, `first_step` and `max_step`. Default: adaptive if one of these is given, else the
+        step of the problem, if it has one.
+    diagnostics, first_step, max_step, rtol, atol
+        As for the solver classes; `rtol` and `atol` are 1e-3 and 1e-6 by default. If `h` is given, they only scale the
+        error metric.
+    max_steps : int, optional
+        Largest number of steps; a run that needs more ends with status -1, and keeps what it has. A faulty run with
+        adaptive steps also ends early if its projections make the steps much shorter than the equations need.
+    {names of ProjectionOptions}
+        As for the solver classes, see `EIPSolver`. Functions of invariants are called as
+        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
+        the run instead.
     variations : str, int, sequence of these or array_like, shape (n, k), optional
         Derivatives of the state that are integrated with it by an explicit method, and projected, except by multistep
         methods, so that they are consistent with the invariants. ``"state"``: with respect to the initial state, the
@@ -146,13 +165,13 @@ def integrate(
         Times at which states are saved, inside `t_span` and in its direction; not together with `save_every`. States
         between steps come from dense output and are projected. Without `save_every` and `t_eval`, the first and the
         last state are saved.
+    dense_output : bool, optional
+        If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     events : callable or sequence of callable, optional
         ``event(t, y[, params]) -> float``, or ``event(t, y, *args)``, with ``terminal`` and ``direction`` as for
         `scipy.integrate.solve_ivp`; Numba functions or C functions, or Python functions, which are called from Python
         even if `fun` is native. An event does not happen where its value is NaN, and not at the start if it is zero
         there to rounding. An event with an infinite ``direction`` is a limit: it also happens at a start beyond it.
-    dense_output : bool, optional
-        If True, store the interpolants of all steps as ``.sol``, a function of time; not available with a checkpoint.
     callback : callable, optional
         ``callback(t, y, residuals)``, called at each saved point with the invariant errors `residuals`; return True to
         stop the run. With `save_every` the interval may then be infinite, as with a terminal event.
@@ -174,16 +193,6 @@ def integrate(
         Continue from the checkpoint, with the same arguments: the result agrees bit by bit with that of an
         uninterrupted run. If the file does not exist, the run starts at the beginning. The `message` of
         the result says which of the two happened.
-    {names of ProjectionOptions}
-        As for the solver classes, see `EIPSolver`. Functions of invariants are called as
-        ``fun(t, y, *args[, params])``; an invariant whose only argument equals `params` is called with the `params` of
-        the run instead.
-    max_steps : int, optional
-        Largest number of steps; a run that needs more ends with status -1, and keeps what it has. A faulty run with
-        adaptive steps also ends early if its projections make the steps much shorter than the equations need.
-    diagnostics, first_step, max_step, rtol, atol
-        As for the solver classes; `rtol` and `atol` are 1e-3 and 1e-6 by default. If `h` is given, they only scale the
-        error metric.
 
     Returns
     -------
@@ -202,6 +211,10 @@ def integrate(
         If the file cannot be written at the start, exists without ``resume=True``, is damaged or used by another run,
         or belongs to one with other arguments or functions.
 
+    See Also
+    --------
+    solve_ivp, ensemble, recommend, eip_scipy.results.IntegrationResult
+
     Notes
     -----
     A step that fails ends the run with ``status=-1``; the result holds everything up to that step. Exceptions raised by
@@ -210,6 +223,11 @@ def integrate(
     checkpoint cannot be written, a RuntimeWarning says so, `message` repeats it, and the previous checkpoint is kept.
 
     The user's functions may store or overwrite the states that they receive: functions that do so receive copies.
+
+    References
+    ----------
+    .. [1] W. Cai, Y. Gong, Y. Wang, "An explicit and practically invariants-preserving method for conservative
+       systems".
 
     Examples
     --------

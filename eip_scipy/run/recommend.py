@@ -98,6 +98,10 @@ class Recommendation:
     missing : tuple of Invariant
         Invariants of the equations that runs with the given invariants do not keep: linear ones, and momenta of
         particles. The recommended run keeps those that its projection would change; `reason` says so.
+
+    See Also
+    --------
+    eip_scipy.recommend
     """
 
     problem: Problem
@@ -191,6 +195,10 @@ def recommend(
     -----
     ProjectionWarning
         If no run with the projection is reliable and has the wanted error, so that one without it is recommended.
+
+    See Also
+    --------
+    integrate, find_invariants, eip_scipy.results.Recommendation
 
     Notes
     -----

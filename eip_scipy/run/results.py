@@ -56,6 +56,10 @@ def save(result: Any, path: str | os.PathLike[str]) -> None:
     CheckpointError
         If the file cannot be written.
 
+    See Also
+    --------
+    eip_scipy.load, to_dataframe, to_xarray
+
     Examples
     --------
     >>> import tempfile
@@ -99,6 +103,21 @@ def load(path: str | os.PathLike[str]) -> Any:
         If the file cannot be read, for instance because it does not exist.
     ValueError
         If the file was not written by `save`, or is damaged.
+
+    See Also
+    --------
+    eip_scipy.results.save, integrate, eip_scipy.checkpoint.read
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from eip_scipy import EIPRK4, integrate, load
+    >>> from eip_scipy.problems import kepler
+    >>> run = integrate(kepler(), (0, 3), method=EIPRK4, save_every=10)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     run.save(f"{folder}/run.npz")
+    ...     bool((load(f"{folder}/run.npz").y == run.y).all())
+    True
     """
     name = repr(os.fspath(path))
     try:
@@ -151,6 +170,16 @@ def plot(result: Any, names: Any = None, *, orbit: bool | None = None, ax: Any =
         If matplotlib is missing: ``pip install "eip_scipy[plot]"``.
     TypeError, ValueError
         If `ax` is not one Axes, `ax` or `orbit` is given for an ensemble, or no components have names of an orbit.
+
+    See Also
+    --------
+    IntegrationResult, to_dataframe
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import kepler
+    >>> figure = integrate(kepler(), (0, 20), method=EIPRK4, save_every=1).plot()
     """
     if ax is not None and not hasattr(ax, "plot"):
         kind = f"{type(ax).__name__} of shape {ax.shape}" if isinstance(ax, np.ndarray) else type(ax).__name__
@@ -343,6 +372,10 @@ class IntegrationResult(Result):
     multipliers : Multipliers
         For a mechanical system with constraints: Lagrange multipliers at the saved times. Outputs and multipliers are
         computed when they are first requested.
+
+    See Also
+    --------
+    eip_scipy.integrate, plot, save, to_dataframe, to_xarray
 
     Notes
     -----

@@ -74,6 +74,10 @@ class OdeResult(Result):
         The record of the projections.
     variations : ndarray, shape (m, n, k)
         The columns of derivatives of the state at the times `t`, if they were requested.
+
+    See Also
+    --------
+    eip_scipy.solve_ivp
     """
 
     t: np.ndarray
@@ -194,6 +198,15 @@ def solve_ivp(
         If the run is not reliable.
     UserWarning
         If an option has no effect for the method.
+
+    See Also
+    --------
+    integrate, scipy.integrate.solve_ivp, eip_scipy.solvers.EIPSolver, eip_scipy.results.OdeResult
+
+    References
+    ----------
+    .. [1] W. Cai, Y. Gong, Y. Wang, "An explicit and practically invariants-preserving method for conservative
+       systems".
 
     Examples
     --------

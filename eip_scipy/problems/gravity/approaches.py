@@ -112,6 +112,10 @@ class Transits(NamedTuple):
     derivatives : ndarray, shape (m, c), or None
         Derivatives of the times along the c columns of derivatives of the run, in the order of `run.variations`: with
         respect to the components of the initial state for ``variations="state"``, then to parameters.
+
+    See Also
+    --------
+    transits, nbody
     """
 
     times: np.ndarray
@@ -144,6 +148,10 @@ def transits(run: Any, star: int | str = 0, axis: Sequence[float] = (0, 0, 1)) -
     TypeError, ValueError
         If `run` is not a run of bodies, or was continued from another one; if `star` or `axis` is wrong.
 
+    See Also
+    --------
+    nbody, Transits
+
     Examples
     --------
     >>> import numpy as np
@@ -151,7 +159,7 @@ def transits(run: Any, star: int | str = 0, axis: Sequence[float] = (0, 0, 1)) -
     >>> from eip_scipy.problems import nbody, transits
     >>> star, planet = np.zeros(3), np.array([0, 0, 1.0])
     >>> problem = nbody([1, 0], [star, planet], [star, [1.0, 0, 0]], t_span=(0, 10))
-    >>> found = transits(integrate(problem, method=EIPDOP853, rtol=1e-11, variations="state"))
+    >>> found = transits(integrate(problem, method=EIPDOP853, rtol=1e-11, atol=1e-11, variations="state"))
     >>> found.times / (2 * np.pi), found.planet, found.derivatives.shape
     (array([1.]), array([1]), (1, 12))
     """

@@ -56,6 +56,17 @@ class ForceConstants:
         falls by a factor of e; and the angular velocity of the air about the pole, for "drag".
     beta : sequence of N floats, optional
         Radiation pressure over the Sun's gravitation, of each body, 0 for the Sun; for "radiation".
+
+    See Also
+    --------
+    nbody
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import ForceConstants, nbody
+    >>> orbit = [1.0, 0.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 1, 0]]
+    >>> nbody(*orbit, t_span=(0, 9), forces="1pn", constants=ForceConstants(c=1e4)).invariants
+    (Invariant(H), Invariant(L))
     """
 
     c: float | None = None

@@ -103,6 +103,10 @@ def nbody(
     UserWarning
         If all relative speeds are far from orbital speeds, which suggests inconsistent units.
 
+    See Also
+    --------
+    ForceConstants, orbital_balances, orbital_elements, solar_system, transits
+
     Notes
     -----
     The invariants do not depend on test particles: their gradients are 0 there, and no correction moves test particles.
@@ -117,6 +121,17 @@ def nbody(
     says when the first run begins, or else as many as there are processors, up to 16; 1 turns that off. The results
     have the same bits for any number of threads. Members of an ensemble that run at the same time, and processes of
     `multiprocessing` without that variable, use one thread each.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPRKN12, integrate
+    >>> from eip_scipy.problems import nbody
+    >>> gm, a = np.array([4 * np.pi**2, 0.04]), np.array([0.0, 1.0])  # AU and years
+    >>> position, velocity = np.outer(a, [1, 0, 0]), np.outer(a, [0, 2 * np.pi, 0])
+    >>> run = integrate(nbody(gm, position, velocity, t_span=(0, 10), h=0.02), method=EIPRKN12)
+    >>> run.trusted, bool(run.diagnostics.max_residual.max() < 1e-12)
+    (True, True)
     """
     masses, q, v = _masses(gm, G), real_array("position", position), real_array("velocity", velocity)
     _check_bodies(masses, q, v)

@@ -47,6 +47,17 @@ class OrbitalElements:
         Omega - omega - M.
     n, P : ndarray
         Mean motion in radians per unit of time, and period 2 pi / n; negative for a hyperbola, as in REBOUND.
+
+    See Also
+    --------
+    orbital_elements
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import orbital_elements
+    >>> found = orbital_elements([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1.1, 0], gm=[1, 0])
+    >>> found.bodies, found.e.round(3), found.P.round(3)
+    (('1',), array([0.21]), array([8.948]))
     """
 
     bodies: tuple[str, ...]
@@ -105,6 +116,10 @@ def orbital_elements(run: Any, gm: Any = None, *, primary: str | int = "jacobi")
         If masses are missing.
     ValueError
         If shapes do not fit, `primary` is unknown, or the primary has no mass.
+
+    See Also
+    --------
+    nbody, OrbitalElements
 
     Notes
     -----

@@ -61,6 +61,10 @@ def orbital_balances(
     ValueError
         If a quantity is unknown, masses or states are wrong, or sizes disagree.
 
+    See Also
+    --------
+    nbody, eip_scipy.Balance
+
     Notes
     -----
     These balances replace the total energy and angular momentum as the invariants of a run. The totals remain an

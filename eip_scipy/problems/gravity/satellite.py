@@ -80,6 +80,10 @@ def satellite(
         If a shape is wrong, `mu`, `radius` or `scale_height` is not positive, `j2`, `drag` or `height` is negative, or
         a quantity in `balances` is unknown.
 
+    See Also
+    --------
+    nbody, orbital_elements
+
     Examples
     --------
     >>> import numpy as np

@@ -36,10 +36,20 @@ def pythagorean() -> Problem:
         other; from about t = 60 on they are a binary, and the body of mass 3 leaves. The invariants are those of
         `nbody`; the angular momentum is zero. There are `reference` states at t = 10, 20, ..., 70.
 
+    See Also
+    --------
+    nbody, figure_eight, time_transformed
+
     References
     ----------
-    C. Burrau, Astronomische Nachrichten 195 (1913) 113-118. V. Szebehely, C. F. Peters, Astronomical Journal 72 (1967)
-    876-883.
+    C. Burrau, Astronomische Nachrichten 195 (1913) 113-118, doi:10.1002/asna.19131950602. V. Szebehely, C. F. Peters,
+    Astronomical Journal 72 (1967) 876-883, doi:10.1086/110355.
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import pythagorean
+    >>> pythagorean().params
+    array([3., 4., 5.])
     """
     return nbody(
         [3.0, 4.0, 5.0],
@@ -68,9 +78,23 @@ def figure_eight(periods: float = 100.0) -> Problem:
         period. The invariants are those of `nbody`; the angular momentum is zero. There are `reference` states after 1,
         10 and 100 periods.
 
+    See Also
+    --------
+    nbody, pythagorean
+
     References
     ----------
-    A. Chenciner, R. Montgomery, Annals of Mathematics 152 (2000) 881-901; initial data by C. Simó, there.
+    A. Chenciner, R. Montgomery, Annals of Mathematics 152 (2000) 881-901, doi:10.2307/2661357; initial data by C. Simó,
+    there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from eip_scipy import EIPRKN12, integrate
+    >>> from eip_scipy.problems import figure_eight
+    >>> problem = figure_eight(periods=1)
+    >>> bool(np.allclose(integrate(problem, method=EIPRKN12, h=0.02).y[:, -1], problem.y0, atol=1e-6))
+    True
     """
     if not (is_number(periods, "periods") and periods > 0 and np.isfinite(periods)):
         raise ValueError(f"figure_eight: periods must be positive and finite, got {periods!r}.")
@@ -101,6 +125,16 @@ def comet() -> Problem:
         Before the passage its semi-major axis is 3.2 AU, with perihelia at 1.3 AU; afterwards it is 500 AU. An error
         before the passage has grown 700-fold at the end. The invariants are those of `nbody`. The comet's share in them
         is 1e-17, so that they do not show errors of its orbit. There is a `reference` state at 20 years.
+
+    See Also
+    --------
+    nbody, solar_system, pythagorean
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import comet
+    >>> comet().t_span
+    (0.0, 20.0)
     """
     data = solar_data.load("de440")
     rows = [data.bodies.index(name) for name in ("Sun", "Jupiter", "Saturn")]

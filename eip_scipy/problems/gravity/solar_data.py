@@ -51,6 +51,17 @@ class SolarSystemData:
         Axes of the positions and velocities: "ICRF" or "ecliptic J2000".
     units : str
         Units of length and time of the arrays: "AU, day".
+
+    See Also
+    --------
+    solar_system
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import solar_data
+    >>> data = solar_data.load("de440")
+    >>> data.bodies[3], data.position.shape
+    ('EMB', (10, 3))
     """
 
     name: str

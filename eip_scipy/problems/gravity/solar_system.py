@@ -69,6 +69,18 @@ def solar_system(
     ValueError
         If data, units or forces are unknown, "drag" or "radiation" is given, or "moon-quadrupole" is given for data
         without the Earth-Moon barycentre.
+
+    See Also
+    --------
+    nbody, SolarSystemData, satellite
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRKN12, integrate
+    >>> from eip_scipy.problems import solar_system
+    >>> run = integrate(solar_system(years=1, h=0.01), method=EIPRKN12)
+    >>> run.trusted, run.component_names[:3]
+    (True, ('x_Sun', 'y_Sun', 'z_Sun'))
     """
     known = load(data) if isinstance(data, str) else data
     chosen = check_forces(forces)

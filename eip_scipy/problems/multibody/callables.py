@@ -111,6 +111,10 @@ def mechanism(
         If shapes do not fit, a function that must be linear in u is not, the start does not meet the constraints, the
         mass matrix is not symmetric or not positive, or a given derivative or power is wrong.
 
+    See Also
+    --------
+    mechanics, MechanicsProblem
+
     Notes
     -----
     If all functions are jitted by Numba (except those of `outputs`), the whole problem is compiled, and first

@@ -54,6 +54,18 @@ class MechanicsProblem(Problem):
         Distance within which gradients of constraints, each scaled to length 1, count as dependent.
     motion, parts : Motion, Parts
         Functions of the motion, and those that the problem is made of.
+
+    See Also
+    --------
+    mechanics, mechanism, Problem, eip_scipy.results.Multipliers
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import mechanism
+    >>> pendulum = mechanism([1, 1], [0, -9.81], lambda t, q: [q[0] ** 2 + q[1] ** 2 - 1], q0=[1, 0], u0=[0, 0],
+    ...                      coordinates="x y")
+    >>> pendulum.component_names, len(pendulum.constraints)
+    (('x', 'y', 'u1', 'u2'), 1)
     """
 
     names: Names

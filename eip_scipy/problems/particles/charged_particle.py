@@ -38,6 +38,16 @@ class ParticleProblem(Problem):
     form : {"canonical", "velocity"}
         "canonical" if the state is (x, p), "velocity" if it is (x, v).
     mass, charge : float
+
+    See Also
+    --------
+    charged_particle, tokamak, uniform_field, Problem
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import tokamak
+    >>> tokamak().form
+    'canonical'
     """
 
     field: ParticleField = UNIFORM
@@ -114,6 +124,10 @@ def charged_particle(
     ValueError
         If an argument is wrong, the canonical form has a field without A, or functions of the field are not finite or
         contradict each other at the start.
+
+    See Also
+    --------
+    ParticleField, tokamak, uniform_field
 
     Examples
     --------
@@ -209,6 +223,17 @@ def uniform_field(*, form: str = "canonical", t_end: float = UNIFORM_STEPS * STE
     -------
     ParticleProblem
         With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
+
+    See Also
+    --------
+    charged_particle, tokamak
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import uniform_field
+    >>> integrate(uniform_field(t_end=300), method=EIPRK4).trusted
+    True
     """
     return _of_paper("uniform", UNIFORM, ([0.0, -1.0, 0.0], [0.1, 0.01, 0.0]), form, t_end, h)
 
@@ -229,6 +254,17 @@ def tokamak(
     -------
     ParticleProblem
         With invariants "H" and "L", and `reference` states at each hundredth of the paper's interval.
+
+    See Also
+    --------
+    charged_particle, uniform_field
+
+    Examples
+    --------
+    >>> from eip_scipy import EIPRK4, integrate
+    >>> from eip_scipy.problems import tokamak
+    >>> integrate(tokamak("transit", t_end=300), method=EIPRK4).trusted
+    True
     """
     if orbit not in ORBITS:
         raise ValueError(f"tokamak: orbit must be one of {', '.join(ORBITS)}, got {orbit!r}{nearest(orbit, ORBITS)}")

@@ -52,10 +52,21 @@ class ParticleField:
         step of the differences. The default does not fit positions in metres in the field of a planet or a star, or
         in a trap of micrometres.
 
+    See Also
+    --------
+    charged_particle, tokamak, uniform_field
+
     Notes
     -----
     Differences are central and of order 6, with step length / 128: relative errors of about 1e-12, and 18 evaluations
     of A in each evaluation of the equations. If you give `jacobian` and `electric`, no differences are needed.
+
+    Examples
+    --------
+    >>> from eip_scipy.problems import ParticleField, charged_particle
+    >>> field = ParticleField(lambda x, y, z: (-y / 2, x / 2, 0.0), axisymmetric=True)
+    >>> [item.name for item in charged_particle(field, [1, 0, 0], [0, 1, 0], t_span=(0, 9)).invariants]
+    ['H', 'L']
     """
 
     vector_potential: Callable[..., Any] | None = None

@@ -82,6 +82,10 @@ def hamiltonian(
     ImportError
         If SymPy is not installed.
 
+    See Also
+    --------
+    equations, eip_scipy.problems.mechanics, integrate
+
     Examples
     --------
     >>> from eip_scipy import EIPDOP853, hamiltonian, integrate
@@ -134,6 +138,10 @@ def equations(
     ------
     ValueError, TypeError, ImportError
         As for `hamiltonian`.
+
+    See Also
+    --------
+    hamiltonian, eip_scipy.problems.mechanics, find_invariants
 
     Examples
     --------
@@ -219,6 +227,10 @@ def mechanics(
         allow, or the model has auxiliary speeds.
     ImportError
         If SymPy is not installed.
+
+    See Also
+    --------
+    mechanism, eip_scipy.hamiltonian, MechanicsProblem
 
     Notes
     -----
