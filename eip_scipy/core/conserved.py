@@ -174,7 +174,8 @@ def _masses_from_f(samples: _Samples, rows: list[int]) -> Array | None:
         moving = (v * v + a * a).sum(axis=0)
         M = _rounded((by_v * v - by_q * a).sum(axis=0) / np.where(moving == 0, 1.0, moving))
         errors, sizes = np.abs([by_q + M * a, by_v - M * v]), np.abs([by_q, by_v])
-        if (errors <= HOLDS * sizes.max(axis=2, keepdims=True)).all():  # also False if one is not finite
+        # Forces may cancel at the start, as in a crystal. The comparison is also False if a number is not finite.
+        if (errors <= HOLDS * sizes.max(axis=(1, 2), keepdims=True)).all():
             masses[k] = M
     return None if np.isnan(masses).all() else masses
 

@@ -305,7 +305,7 @@ class InvariantSet:
             slow = ", ".join(repr(label) for _, label in missing)
             warnings.warn(
                 f"no grad is given for {slow}: each gradient by the {n} components takes at least {n} evaluations of "
-                "the invariant, which makes the run 10 to 1000 times slower. Give grad. For w * np.sum(y**2) it is "
+                "the invariant, which makes the run 2 to 1000 times slower. Give grad. For w * np.sum(y**2) it is "
                 "Invariant(fun, grad=lambda t, y: 2 * w * y).",
                 UserWarning,
                 stacklevel=users_level(),

@@ -498,6 +498,40 @@ for _function in ARITHMETIC:
     _define_with_scalar(_function)
 
 
+# Numba turns the expressions x + y into loops, but not calls of operator.add, and so there are four functions.
+def _add(x, y):
+    x[:] = x + y
+    return x
+
+
+def _subtract(x, y):
+    x[:] = x - y
+    return x
+
+
+def _multiply(x, y):
+    x[:] = x * y
+    return x
+
+
+def _divide_array(x, y):
+    x[:] = x / y
+    return x
+
+
+def _define_in_place(function: Any, in_place: Callable[..., Any]) -> None:
+    """Define an operation such as ``x += y`` for an array x of duals, before Numba's own rule, which would fail."""
+    _overload(function, target="cpu")(
+        lambda x, y: in_place if _is_array(x, 1, 2) and isinstance(x.dtype, Dual) else None
+    )
+
+
+for _function, _in_place in (
+    (operator.iadd, _add), (operator.isub, _subtract), (operator.imul, _multiply), (operator.itruediv, _divide_array),
+):  # fmt: skip
+    _define_in_place(_function, _in_place)
+
+
 def _are_arrays_of_duals(*kinds: Any) -> bool:
     return all(_is_array(k, 1, 2) for k in kinds) and any(isinstance(k.dtype, Dual) for k in kinds)
 

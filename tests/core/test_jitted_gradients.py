@@ -45,6 +45,16 @@ def kepler_by_arrays(t, y):
     return 0.5 * np.sum(y[2:] ** 2) - 1.0 / np.sqrt(y[:2] @ y[:2])
 
 
+@case(lambda a, b, c, d: ((a + c / 2 - 3) / c) ** 2 + ((b + d / 2 - 3) / d) ** 2, gate=True)
+def arrays_changed_in_place(t, y):
+    x = y[:2] * 1.0
+    x += y[2:] / 2.0
+    x -= 3.0
+    x /= y[2:]
+    x *= x
+    return x.sum()
+
+
 @case(
     lambda a, b, c, d: mpmath.exp(-a * b) + mpmath.expm1(c) * mpmath.tanh(d) + mpmath.log(c) + mpmath.log1p(a),
     gate=True,

@@ -197,6 +197,26 @@ def in_turn(t, y):
     return np.array([y[1], -y[0] - y[0] * y[2] ** 2, y[3], -y[2] - y[2] * y[0] ** 2])
 
 
+def crystal():
+    """Atoms on a ring at equal distances: forces cancel up to rounding at the start."""
+
+    sites, side = 1.3 * np.arange(30), 39.0
+
+    def both(y):
+        q = sites + y[:30]
+        d = np.roll(q, -1) - q
+        return d - side * np.round(d / side)
+
+    def fun(t, y):
+        pull = 24 * (both(y) ** -7 - 2 * both(y) ** -13)
+        return np.concatenate([y[30:], pull - np.roll(pull, 1)])
+
+    def energy(t, y):
+        return (y[30:] ** 2).sum() / 2 + 4 * (both(y) ** -12 - both(y) ** -6).sum()
+
+    return fun, energy
+
+
 def energy_squared():
     fun, energy = magnetic_momenta()
     return fun, lambda t, y: energy(t, y) ** 2
@@ -211,6 +231,7 @@ OTHERS = [
     (lambda: (in_turn, lambda t, y: (y @ y + y[0] ** 2 * y[2] ** 2) / 2), [0.3, 0.5, -0.2, 0.1], False),
     (lambda: (lotka_volterra, lambda t, y: (y - np.log(y)).sum()), [0.5, 0.8], False),
     (energy_squared, [0.5, 0.1, -0.2, 0.6], False),
+    (crystal, [*np.zeros(30), *0.1 * np.sin(np.arange(30.0) ** 2)], True),
 ]
 
 
