@@ -46,5 +46,5 @@ places.set_ylabel("error of the place [m]")
 for axis in (energies, places):
     axis.set(xlabel="days", xlim=(0, DAYS))
     axis.grid(alpha=0.3)
-figure.legend(loc="outside upper center", ncols=2, frameon=False)
+figure.legend(loc="outside upper center", ncols=2, frameon=False, title="rtol = 3e-10, atol = 1e-11")
 figure.savefig("low-orbit.png", dpi=120)
