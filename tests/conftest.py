@@ -79,6 +79,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         terminalreporter.write_line("slow tests were left out; to run them: python -m pytest -m slow")
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if item.get_closest_marker("nightly"):  # which is slow by definition
+        item.add_marker("slow")
+
+
 @pytest.hookimpl(trylast=True)  # of the tests that were chosen
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if leaves_slow_out(config):

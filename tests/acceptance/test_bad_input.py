@@ -28,7 +28,7 @@ from eip_scipy import (
 from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 Y0 = [1.0, 2.0]
 FIXED = {"method": EIPRK4, "h": 0.1}
 square, square_gradient = SQUARE.fun, SQUARE.grad

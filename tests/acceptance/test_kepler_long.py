@@ -9,7 +9,7 @@ from scipy.stats import linregress
 from eip_scipy import EIPRK4, EIPRK5, integrate
 from eip_scipy.problems import kepler
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 
 PROBLEM = kepler()
 T, H = 1e5, 0.03

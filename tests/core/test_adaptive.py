@@ -22,21 +22,10 @@ from systems import (
     pericentre,
 )
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK2,
-    EIPRK3,
-    EIPRK4,
-    EIPRK5,
-    EIPRK23,
-    EIPRK45,
-    Diagnostics,
-    Invariant,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Diagnostics, Invariant, integrate
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 METHODS = [EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
 second_order = pytest.param(EIPRK2, marks=NIGHTLY)  # in thousands of steps
 methods = pytest.mark.parametrize("method", [second_order, *METHODS], ids=lambda m: m.__name__)

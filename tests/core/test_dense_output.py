@@ -14,7 +14,7 @@ from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invar
 from eip_scipy.problems import solar_system
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
 

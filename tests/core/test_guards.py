@@ -43,10 +43,7 @@ def turning(**options):
 
 
 @metrics
-@pytest.mark.parametrize(
-    ("method", "h"),
-    [(EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK4, 0.03), (EIPRK5, 0.05)],
-)
+@pytest.mark.parametrize(("method", "h"), [(EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK4, 0.03), (EIPRK5, 0.05)])
 def test_circular_kepler(metric, method, h):
     """Truncation errors make parallel gradients nearly so: a poor correction does not end a correct run."""
     for eccentricity in (0.0, 1e-8, 1e-4):

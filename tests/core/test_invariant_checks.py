@@ -330,11 +330,7 @@ CONSTRAINED = {
     "four-bar, slanted": (FOUR_BAR, [0.6, 0.8, 1.6, 0.8, 0, 0, 0, 0]),
     "four-bar, flat": (FOUR_BAR, [1, 0, 2, 0, 0, 0, 0, 0]),
 }
-STEPS = {
-    "loose": (EIPRK45, {}),
-    "tight": (EIPDOP853, {"rtol": 1e-8, "atol": 1e-8}),
-    "fixed": (EIPRK4, {"h": 0.01}),
-}
+STEPS = {"loose": (EIPRK45, {}), "tight": (EIPDOP853, {"rtol": 1e-8, "atol": 1e-8}), "fixed": (EIPRK4, {"h": 0.01})}
 
 
 @pytest.mark.parametrize("name", CONSTRAINED)

@@ -70,8 +70,7 @@ SYMMETRIC_POINT = pytest.mark.xfail(
 
 
 @pytest.mark.parametrize(
-    "method",
-    [EIPRK2, pytest.param(EIPRK3, marks=SYMMETRIC_POINT), EIPRK4, pytest.param(EIPRK5, marks=SYMMETRIC_POINT)],
+    "method", [EIPRK2, pytest.param(EIPRK3, marks=SYMMETRIC_POINT), EIPRK4, pytest.param(EIPRK5, marks=SYMMETRIC_POINT)]
 )
 def test_order_of_the_solution_without_blocks(method, end):
     order = order_of(method, end, {"metric": "error", "blocks": None})

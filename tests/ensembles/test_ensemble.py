@@ -11,13 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numba import njit
-from systems import (
-    SQUARE,
-    oscillator,
-    pericentre,
-    refuse,
-    same_fields,
-)
+from systems import SQUARE, oscillator, pericentre, refuse, same_fields
 
 from eip_scipy import EIPRK4, EIPRK5, EIPRKN12, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.problems import Problem, kepler

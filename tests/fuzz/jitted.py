@@ -64,10 +64,7 @@ def energy_gradient_by_f(t, y, f, out, p):
 
 
 NAME = "jitted"
-KEPT = {
-    "energy": (energy, energy_gradient, False),
-    "energy by f": (energy, energy_gradient_by_f, True),
-}
+KEPT = {"energy": (energy, energy_gradient, False), "energy by f": (energy, energy_gradient_by_f, True)}
 # Few, since Numba compiles each choice by itself.
 CHOICES = ((), ("energy",), ("energy by f",), ("energy", "energy by f"))
 

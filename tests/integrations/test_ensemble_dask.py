@@ -61,7 +61,6 @@ def test_functions_without_a_module(client):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.posix
 def test_a_killed_worker_loses_nothing(client):
     victims, y0s = list(client.run(os.getpid).values())[:1], starts(400)

@@ -13,7 +13,7 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, check_gradient, integrate
 from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, tokamak, uniform_field
 
 POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5)]
-VELOCITY = pytest.param("velocity", marks=[pytest.mark.nightly, pytest.mark.slow])
+VELOCITY = pytest.param("velocity", marks=pytest.mark.nightly)
 FORMS = pytest.mark.parametrize("form", ["canonical", VELOCITY])
 MAKERS = pytest.mark.parametrize("make", [uniform_field, tokamak])
 
@@ -159,9 +159,7 @@ def truth():
     return mirror_run(WHOLE, "canonical")[1]
 
 
-@pytest.mark.parametrize(
-    "name", [k if k in GATE else pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in MIRRORS]
-)
+@pytest.mark.parametrize("name", [k if k in GATE else pytest.param(k, marks=pytest.mark.nightly) for k in MIRRORS])
 def test_own_field(name, truth):
     field, form, kept = MIRRORS[name]
     run, end = mirror_run(field, form)
@@ -210,7 +208,6 @@ def test_a_wrong_claim_of_symmetry_is_seen():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("form", ["velocity", "canonical"])
 def test_compiled_functions_may_return_integers_and_arrays(form):

@@ -257,8 +257,7 @@ def test_inputs_are_expressions_or_functions(pushed, given):
 
 
 @pytest.mark.parametrize(
-    ("given", "force"),
-    [(halving, 0.1), (njit(halving), 0.1), (sympy.sin(TIME) - 3 * x, np.sin(0.5) - 0.6), (0, 0)],
+    ("given", "force"), [(halving, 0.1), (njit(halving), 0.1), (sympy.sin(TIME) - 3 * x, np.sin(0.5) - 0.6), (0, 0)]
 )
 def test_inputs_of_the_state_do_not_change_it(pushed, given, force):
     problem = mechanics(pushed, {m: 2, k: 3}, [0], [1], inputs={"push": given})
@@ -414,10 +413,7 @@ NAME_OF_X, NAME_OF_RATE, RATE = sympy.Symbol("x"), sympy.Symbol("v_x"), me.dynam
     ],
 )
 def test_different_quantities_have_different_names(force, params, says):
-    for model in (
-        on_a_line(force, speed=RATE, by_rate=True),
-        me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x]),
-    ):
+    for model in (on_a_line(force, speed=RATE, by_rate=True), me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x])):
         with pytest.raises(ValueError, match=says):
             mechanics(model, params, [1], [0])
 

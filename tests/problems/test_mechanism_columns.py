@@ -13,7 +13,7 @@ from eip_scipy.problems import mechanics, mechanism
 G = 9.81
 OPTIONS = {"method": EIPDOP853, "h": 0.02}
 TIGHT = {"method": EIPDOP853, "rtol": 1e-12, "atol": 1e-12}
-LATER = (pytest.mark.nightly, pytest.mark.slow)  # each jitted system takes many seconds to compile
+LATER = pytest.mark.nightly  # each jitted system takes many seconds to compile
 
 
 def plain(function):
@@ -112,7 +112,6 @@ def flow_differences(problem, directions, step=1e-4):
 
 @pytest.mark.needs_jit
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_columns_are_differences_of_the_flow(name):
     """The flow is that of functions that are not jitted, whose compilation would take as long again."""
@@ -132,7 +131,7 @@ def period_and_slope(angle, omega):
     return 4 * K / omega, 4 * slope / omega
 
 
-@pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[*LATER, pytest.mark.needs_jit])])
+@pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[LATER, pytest.mark.needs_jit])])
 def test_matrix_of_a_pendulum_after_its_period(jit):
     period, slope = period_and_slope(1.0, np.sqrt(G))
     run = integrate(system("1, free", jit), t_span=(0, period), variations="state", **TIGHT)

@@ -8,22 +8,13 @@ import pytest
 from numba import njit
 from scipy.special import ellipk
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    Balance,
-    EIPRadau,
-    Invariant,
-    ensemble,
-    integrate,
-    load,
-)
+from eip_scipy import EIPDOP853, EIPRK4, Balance, EIPRadau, Invariant, ensemble, integrate, load
 from eip_scipy.problems import kepler, mechanism
 from eip_scipy_studies.bench import mechanisms as examples
 
 G = 9.81
 STATE = np.array([0.8, -0.6, 0.3, 0.4])
-NIGHTLY = (pytest.mark.nightly, pytest.mark.slow)
+NIGHTLY = pytest.mark.nightly
 
 
 def plain(function):
@@ -31,7 +22,7 @@ def plain(function):
 
 
 # Functions that are jitted take many seconds to compile: most tests are of plain ones.
-JITS = pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[*NIGHTLY, pytest.mark.needs_jit])])
+JITS = pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[NIGHTLY, pytest.mark.needs_jit])])
 
 
 def run(problem, tolerance, **options):
@@ -388,7 +379,6 @@ def test_no_step_ends_next_to_a_singular_position():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "tolerance", "end", "error"),
     [
@@ -408,7 +398,6 @@ def test_known_motions(make, tolerance, end, error):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_bricards_mechanism_has_redundant_constraints():
     problem = examples.bricard()
     assert "24 on velocities of rank 23, 1 degree of freedom" in repr(problem)

@@ -153,7 +153,7 @@ def test_pythagorean_to_its_end():
     ("make", "g"),
     [
         (lambda: kepler(0.6, 0.0), centre_time),
-        pytest.param(pythagorean, pair_time, marks=[pytest.mark.nightly, pytest.mark.slow]),
+        pytest.param(pythagorean, pair_time, marks=pytest.mark.nightly),
     ],
 )
 def test_transformed_problem_has_the_same_invariants(make, g):
@@ -173,7 +173,7 @@ def test_transformed_problem_has_the_same_invariants(make, g):
 
 
 @pytest.mark.needs_jit
-@pytest.mark.parametrize("forces", ["j2", pytest.param("1pn", marks=(pytest.mark.nightly, pytest.mark.slow))])
+@pytest.mark.parametrize("forces", ["j2", pytest.param("1pn", marks=pytest.mark.nightly)])
 def test_fictitious_time_of_problems_whose_parameters_are_more_than_the_masses(forces):
     problem = solar_system(years=1, forces=forces)
     run = integrate(time_transformed(problem, 1e6), method=EIPDOP853, h=0.05, events=reaches(1.0))

@@ -17,17 +17,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from systems import DOUBLE_PENDULUM, HENON_HEILES, INERTIA, RELATIVISTIC_KEPLER, RIGID_BODY, SO3, TWO_RODS
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRKN12,
-    check_gradient,
-    ensemble,
-    equations,
-    hamiltonian,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN12, check_gradient, ensemble, equations, hamiltonian, integrate
 from eip_scipy.problems import kepler
 
 MOMENTUM = {"L": "x*py - y*px"}
@@ -252,7 +242,7 @@ def pendulum():
 @pytest.mark.parametrize(
     ("make", "y0", "end"),
     [(lambda: hamiltonian(HENON_HEILES), [0.0, 0.1, 0.5, 0.0], 100),
-     pytest.param(pendulum, [1.0, 0.5, 0.2, -0.1], 5, marks=[pytest.mark.nightly, pytest.mark.slow])],
+     pytest.param(pendulum, [1.0, 0.5, 0.2, -0.1], 5, marks=pytest.mark.nightly)],
 )  # fmt: skip
 def test_runs_are_those_of_scipy_and_forces_are_gradients(make, y0, end):
     problem, y0, grad = make(), np.array(y0), np.empty(4)

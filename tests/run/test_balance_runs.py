@@ -12,16 +12,7 @@ from systems import BALANCES, QUARTIC_PARAMS, QUARTIC_START, swinging
 from systems import quartic_energy as energy
 from systems import quartic_rate as rate
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRK45,
-    Balance,
-    Invariant,
-    ProjectionWarning,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK45, Balance, Invariant, ProjectionWarning, integrate
 from eip_scipy.checkpoint import CheckpointError
 
 RUNS = [

@@ -90,7 +90,6 @@ WRITERS = [writing_now_and_then, writing_by_a_function]
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @all_of_them
 def test_right_hand_sides_that_write(how):
     """Also where SciPy takes the steps, whose own class lets them write to its state."""

@@ -107,7 +107,6 @@ def test_a_package_that_fails_is_a_row():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_command_writes_runs_and_page(tmp_path):
     assert main(["bench", "double pendulum", "--solvers", "SciPy DOP853", "--out", str(tmp_path), "--quiet"]) == 0
     rows = list(csv.DictReader((tmp_path / "bench.csv").read_text(encoding="utf-8").splitlines()))
@@ -118,7 +117,6 @@ def test_command_writes_runs_and_page(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("group", ["eigenstates", "Hénon-Heiles", "Huber"])
 def test_metric_on_the_page(group, tmp_path):
     (printed,) = (table[group] for table in printed_tables("explanation/metric.md") if group in table)

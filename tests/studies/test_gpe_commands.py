@@ -41,7 +41,6 @@ def run(out, start, checkpoint=None, resume=False):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.usefixtures("snapshots")
 @pytest.mark.parametrize(("broken", "evaluation", "done"), [(0, 207, set()), (2, 93, {"EIP-M"})])
 def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, start, capsys, monkeypatch):

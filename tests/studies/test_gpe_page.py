@@ -15,7 +15,7 @@ from eip_scipy_studies.comparators import crank_nicolson, linearly_implicit
 from eip_scipy_studies.condensates import efficiency, quench, states
 from eip_scipy_studies.output import Output
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 PAGE = "results/gross-pitaevskii.md"
 TRAP, RING, LINES, EFFICIENCY = 1, 2, 4, 6  # numbers of the tables
 TEXT = " ".join((PAGES / PAGE).read_text(encoding="utf-8").split())

@@ -93,10 +93,8 @@ def test_command_prints_and_writes(tmp_path, capsys):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "mean", "worst", "losses"),
-    [("EIPRK23", 73, 1.01, 1), ("EIPRK45", 28, 1.5, 1), ("EIPDOP853", 18, 32, 3)],
+    ("method", "mean", "worst", "losses"), [("EIPRK23", 73, 1.01, 1), ("EIPRK45", 28, 1.5, 1), ("EIPDOP853", 18, 32, 3)]
 )
 def test_gains_on_the_pages(method, mean, worst, losses, tmp_path):
     """As the pages on choosing a method and on the metric say; round-off decides on the last losses."""
@@ -115,7 +113,6 @@ def test_gains_on_the_pages(method, mean, worst, losses, tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(("wanted", "near"), [(1e-4, 31), (1e-6, 33), (1e-8, 35)])
 def test_errors_on_the_page_on_recommend(wanted, near):
     found, expected = [], []

@@ -51,7 +51,6 @@ def test_numbers_agree_to_the_printed_digits_except_where_listed():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("series", [s for s in SERIES if s["table"] == 5], ids=lambda series: series["name"])
 def test_table_5(series):
     """As the page on condensates says: all but two errors, of 3.5e-13, agree to three digits or more."""
@@ -103,7 +102,6 @@ def test_short_runs_of_figures_1_and_2(tmp_path, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_figures_1_and_2(tmp_path):
     """Kept invariants prove nothing about the orbit: RK2's is lost, RK5's is not."""
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path)]) == 0
@@ -112,7 +110,6 @@ def test_figures_1_and_2(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "setting", "evaluations"),
     [

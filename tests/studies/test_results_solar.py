@@ -16,7 +16,7 @@ from eip_scipy.problems import comet, figure_eight, kepler, pythagorean, solar_s
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import comparison, runs
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 KEPT = {"every": 10, "compensated": True}
 MERCURY, VENUS, EARTH, MARS, JUPITER = 0, 1, 2, 3, 4
 

@@ -57,7 +57,6 @@ def test_short_run_with_everything(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.usefixtures("few_methods")
 def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
     """With --checkpoint, completed runs are not repeated; the numbers are those of an uninterrupted command."""
