@@ -235,9 +235,6 @@ def check_refused(options, error, match):
     assert len(str(info.value)) < 400
 
 
-# The state and the right-hand side.
-
-
 @both
 def test_y0_without_masked_values_and_unchanged(driver):
     plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
@@ -307,9 +304,6 @@ def test_exceptions_of_the_user_pass_unchanged(part, error):
         assert info.value is error
 
 
-# The interval and the step.
-
-
 def test_times_of_the_solver_class():
     """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
     infinite = [(-math.inf, 0), (math.inf, math.inf), (math.nan, 1), (0, math.nan)]
@@ -356,9 +350,6 @@ def test_steps_end_on_t_bound(driver):
         sign = np.sign(span[1] - span[0])
         np.testing.assert_array_equal(run.t[:-1], span[0] + np.arange(n) * (sign * h))
         assert (sign * np.diff(run.t) > 1e-7 * h).all()
-
-
-# Tolerances and options.
 
 
 @both
@@ -414,9 +405,6 @@ def test_times_of_dense_output_are_real():
     assert sol([0, 1]).shape == (2, 2)
     with pytest.raises(TypeError, match="dense output is defined at real times, got"):
         by_scipy(t_eval=[0.5 + 0j], invariants=SQUARE)
-
-
-# Invariants.
 
 
 WRONG_INVARIANTS = [

@@ -276,9 +276,6 @@ def test_nfev_is_the_number_of_calls(driver):
             assert found.nfev == len(calls), (method, options)
 
 
-# Memory, saving, progress.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
 def test_memory_bound_of_an_adaptive_run(compiled):

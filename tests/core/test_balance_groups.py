@@ -225,9 +225,6 @@ def test_rates_of_another_kind():
             integrate(damped, (0, 1), [1.0, 0.0], method=EIPRK4, h=0.1, invariants=balance)
 
 
-# Checks.
-
-
 @pytest.mark.parametrize("by", [lambda t, y: y.copy(), None], ids=["gradient", "complex step"])
 @pytest.mark.parametrize("wrong", [1e-3, -1.0, 100.0])
 def test_a_wrong_rate_is_named(by, wrong):

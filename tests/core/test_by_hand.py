@@ -238,9 +238,6 @@ def test_wrong_values_raise(method, name, value, match):
             solver.step()
 
 
-# Copies.
-
-
 class PendulumVerlet:
     """A user-defined one-step method."""
 

@@ -130,9 +130,6 @@ def test_late_calls_do_not_disturb_a_running_solver(method, invariants):
         np.testing.assert_array_equal(piece(0.4 * piece.t_old + 0.6 * piece.t), y)
 
 
-# Events near the ends of steps.
-
-
 def thresholds(sol, shifts, components=(0, 2), most=10):
     """Return pairs (component, value): thresholds within some relative shifts of states at up to `most` steps."""
     steps = np.unique(np.linspace(1, len(sol.t) - 2, most).astype(int))
@@ -171,9 +168,6 @@ def test_adversarial_thresholds(method, kind, rtol):
         assert np.abs(y[:, i] - value).max(initial=0.0) <= 1e-11
         assert residuals(y.T).max(initial=0.0) <= max(level, 1e-14) * (1 + 1e-3) + 4e-15
         assert (np.diff(t) * np.sign(sol.t[-1] - sol.t[0]) >= 0).all()
-
-
-# Samples on the manifold.
 
 
 @pairs

@@ -131,9 +131,6 @@ def test_without_any_gradient_the_raw_state_stays(direction):
     assert (result.rank, *result.y, *result.correction, *result.residual) == (0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
-# Units and amplitudes.
-
-
 @metrics
 @pytest.mark.parametrize(("blocks", "atol"), [(None, 0.0), (3, 1e-6)])
 @pytest.mark.parametrize("amplitude", [1e-160, 1e-155, 1e-20, 1.0, 1e150])
@@ -202,9 +199,6 @@ def test_row_inside_the_band_stays():
     assert result.rank == 2
     assert abs(result.y.sum() - 1.0) <= 2 * EPS
     assert abs(project([1.0, 0.0, 0.0], sphere).y.sum() - 1.0) > 1e-3
-
-
-# Duplicate and contradicting invariants.
 
 
 def test_contradicting_targets():

@@ -50,9 +50,6 @@ def test_a_function_stands_for_its_invariant_everywhere():
     np.testing.assert_allclose(run.invariants, 2.0, rtol=1e-12)  # the run's own arguments come last
 
 
-# Gradients that are not given.
-
-
 def wall(t, y):
     beyond = np.maximum(abs(y[0]) - 1, 0)
     return np.array([y[1], -y[0] - 150 * beyond**2 * np.sign(y[0])])
@@ -229,9 +226,6 @@ def test_single_precision_explains_no_friction():
     friction = in_single(lambda t, y: pendulum(t, y) - np.array([0.0, 0.1 * y[1]], np.float32))
     _, texts = said(lambda: integrate(friction, (0, 5), [1.0, 0.3], method=EIPRK4, h=0.05, invariants=PENDULUM_ENERGY))
     assert "'energy' is not an invariant of this system" in texts[0]
-
-
-# Times.
 
 
 @pytest.mark.parametrize("span", [(0.0, 1.0), (1.0, 0.0), (2.0, 2.0), (5.0, 5.001), (0.0, 1e-9)])

@@ -175,9 +175,6 @@ def test_iterations_are_newton_s(seed, size, iterations):
     np.testing.assert_allclose(result.y, y, rtol=0, atol=1e-13)
 
 
-# Complex states.
-
-
 class ComplexQuadratic:
     """Hermitian forms y^H M y: the mass |y|^2, and a random one."""
 

@@ -65,9 +65,6 @@ def test_resume_starts_where_there_is_nothing(tmp_path):
     same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
 
 
-# Another ensemble, other functions.
-
-
 def test_another_ensemble_is_refused(tmp_path):
     half_done(tmp_path / "kept")
     before = (tmp_path / "kept").read_bytes()

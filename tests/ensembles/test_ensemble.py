@@ -42,9 +42,6 @@ def same_members(run, single):
     assert run.names == tuple(own.diagnostics.names)
 
 
-# A member is the single run.
-
-
 def test_one_number_for_each_member_of_a_problem_with_one_parameter():
     def decay(t, y, out, params):
         out[:] = -params[0] * y
@@ -85,9 +82,6 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
     for run in runs[1:]:
         same_fields(runs[0], run)
     same_fields(ensemble(kepler(), SPAN, y0s, chunk=7, **more), runs[0], but=["chunk"])
-
-
-# Failures.
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=[needs_jit, pytest.mark.slow])])
@@ -210,9 +204,6 @@ def test_progress(capsys):
     assert "4.00/4.00" in capsys.readouterr().err
 
 
-# Bad input.
-
-
 def test_bad_input():
     masked = np.ma.array(np.ones((2, 2)), mask=np.eye(2))
     with_args = Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,))
@@ -239,9 +230,6 @@ def test_bad_input():
     ]
     given = {"fun": oscillator, "t_span": (0, 1), "y0s": np.eye(2), "h": 0.1}
     refuse(ensemble, [(given | options, *rest) for options, *rest in rows])
-
-
-# Executors of concurrent.futures.
 
 
 @njit

@@ -171,8 +171,6 @@ def test_a_wrong_reduce():
         assert info.value.partial.status.shape == (len(STARTS),)
 
 
-# Executors, files.
-
 CASES = {
     "last states": {},
     "rows": {"save_every": 50},
@@ -206,9 +204,6 @@ def test_saved_and_loaded_and_run_elsewhere(case, tmp_path):
     same_fields(run, load(tmp_path / "again.npz"))
     with np.load(tmp_path / "run.npz", allow_pickle=False) as file:  # no pickle
         np.testing.assert_array_equal(file["y"], run.y)
-
-
-# Figures.
 
 
 def drawn(run, **options):

@@ -212,9 +212,6 @@ def random_case(seed: int) -> Case:
     return Case(seed=seed, system=system, method=name, t_span=t_span, **given, **options, **known)
 
 
-# Preserved quantities.
-
-
 def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
     """Return some preserved quantities, in any order, perhaps with a dependent one, or two of them as one vector."""
     kept = system.kept
@@ -305,9 +302,6 @@ def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array
     return Invariant(fun, fill if in_place else value, in_place=in_place, uses_f=by_f is not None, **options)
 
 
-# How it is run.
-
-
 def _steps(
     rng: np.random.Generator, system: System, h: float, length: float, least_rtol: float | None, size: Array
 ) -> dict[str, Any]:
@@ -364,9 +358,6 @@ def _event(rng: np.random.Generator, k: int, size: Array) -> Callable[..., float
     event.terminal = [False, False, True, 2][rng.integers(4)]  # type: ignore[attr-defined]
     event.direction = float(rng.integers(-1, 2))  # type: ignore[attr-defined]
     return event
-
-
-# Known properties of the motion.
 
 
 def _rate(system: System, sign: float) -> float:

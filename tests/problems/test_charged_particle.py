@@ -18,9 +18,6 @@ FORMS = pytest.mark.parametrize("form", ["canonical", VELOCITY])
 MAKERS = pytest.mark.parametrize("make", [uniform_field, tokamak])
 
 
-# --- the paper's fields ---
-
-
 def paper_uniform(x, y, z):
     """Return A and phi as printed."""
     return (-y / 2, x / 2, mp.mpf(0)), mp.mpf("1e-2") / mp.sqrt(x**2 + y**2)
@@ -72,9 +69,6 @@ def test_fields_are_the_papers(field, paper):
         np.testing.assert_array_equal(field.along(key, np.array(POINTS).T), expected)
 
 
-# --- equations and invariants ---
-
-
 @FORMS
 @MAKERS
 def test_invariants_reference_and_order(make, form):
@@ -107,9 +101,6 @@ def test_orientation_of_the_axes_does_not_matter():
         problem = charged_particle(TOKAMAK, R @ x, R @ v, t_span=(0.0, 60.0), h=math.pi / 10)
         ends.append(R.T @ integrate(problem, method=EIPRK4).y[:3, -1])
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
-
-
-# --- user-defined fields ---
 
 
 constant_a, constant_b = njit(lambda x, y, z: (-y, x, 0.0)), njit(lambda x, y, z: (0.0, 0.0, 2.0))
@@ -235,9 +226,6 @@ def test_compiled_functions_may_return_integers_and_arrays(form):
     np.testing.assert_array_equal(out, [0, 0, 0, 0, 0, 1])
 
 
-# --- fields that vary, and balances ---
-
-
 def ring_a(t, x, y, z):
     around = (1 + 1e-4 * t) * (0.5 + (x * x + y * y) / 4)
     return -around * y, around * x, 0.0
@@ -294,9 +282,6 @@ def test_energies_in_fields_that_do_work(field, balances, names):
     assert run.trusted
     exact = solve_ivp(problem.fun, problem.t_span, y, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
     np.testing.assert_allclose(run.y[:, -1], exact, rtol=0, atol=2e-7)
-
-
-# --- wrong input ---
 
 
 def start(field=UNIFORM, position=(1.0, 0, 0), velocity=(0, 0.1, 0), **options):

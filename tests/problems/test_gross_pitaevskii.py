@@ -42,9 +42,6 @@ def second_derivative(n, length):
     return (2 * np.pi / length) ** 2 * D
 
 
-# The right-hand side.
-
-
 @pytest.mark.parametrize("nyquist", ["true", "zero"])
 @pytest.mark.parametrize("Omega", [0.0, 0.7])
 def test_two_dimensions_are_the_papers_dense_matrices(Omega, nyquist):
@@ -121,9 +118,6 @@ def test_transforms_are_numpys_with_any_library_and_threads(library, monkeypatch
     np.testing.assert_allclose(found, one.fun(0.0, psi), rtol=0, atol=1e-15 * abs(found).max())
 
 
-# Invariants.
-
-
 @pytest.mark.parametrize("shape", [(8,), (6, 8), (4, 6, 4)])
 def test_gradients(shape):
     grid = Grid(shape, -2, 2)
@@ -168,9 +162,6 @@ def test_angular_momentum_is_kept_where_the_trap_is_round_and_refused_where_not(
         pytest.warns(ProjectionWarning, match="'angular_momentum'"),
     ):
         integrate(oval, method=EIPRK4)
-
-
-# Mass and energy as one.
 
 
 @pytest.fixture(params=[(8, 16), (6, 7), (5, 9, 21)], ids=str)
@@ -241,9 +232,6 @@ def test_joint_invariants_fail_are_copied_and_continued(monkeypatch):
     np.testing.assert_array_equal(integrate(p, method=EIPRK4).y[:, -1], single.y[:, -1])
 
 
-# Steps.
-
-
 @pytest.fixture(scope="module")
 def travelling():
     return soliton(points=320, velocity=4.0, length=48.0, t_end=0.48)
@@ -296,8 +284,6 @@ def test_fields_of_a_run_and_adaptive_steps():
     sol = solve_ivp(p.fun, p.t_span, p.y0, method=EIPRK45, rtol=1e-8, atol=1e-10, invariants=p.invariants)
     np.testing.assert_allclose(sol.y[:, -1], p.reference(0.5), atol=1e-6)
 
-
-# Mistakes of users.
 
 SQUARE, LINE = Grid((8, 8), -1, 1), Grid(8, -1, 1)
 WRONG = [

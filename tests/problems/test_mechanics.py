@@ -165,9 +165,6 @@ def test_a_pole_of_dependent_speeds_is_none_of_the_motion():
     assert solve_ivp(problem.motion_at, (0, 0.1), problem.y0, rtol=1e-9, atol=1e-9).success
 
 
-# Energies.
-
-
 def test_springs_of_a_model_belong_to_its_energy():
     q1, q2, u1, u2 = me.dynamicsymbols("q1 q2 u1 u2")
     A = FRAME.orientnew("A", "Axis", [q1, FRAME.z])
@@ -303,9 +300,6 @@ def test_a_pendulum_hangs_on_a_point_that_moves(hanging):
     np.testing.assert_allclose(found, expected - rate**2 * np.array([np.sin(a), -np.cos(a)]), rtol=1e-14)
 
 
-# Momenta and quaternions.
-
-
 def test_momenta_of_cyclic_coordinates_are_kept():
     # A bead on a cone z = r, in cylindrical coordinates: p_phi = r^2 phi'.
     r, phi, z = me.dynamicsymbols("r phi z")
@@ -361,9 +355,6 @@ def test_norms_of_quaternions_are_kept():
         mechanics(model, {}, [1, 0.1, 0, 0, 0, 0, 0], speeds)
 
 
-# Parameters.
-
-
 def test_parameters_are_given_by_name_or_symbol(pushed):
     options = {"t_span": (0, 2), "inputs": {push: 0}, "outputs": {"spring": k * x}}
     problem = mechanics(pushed, {m: 2, "k": 3}, [1], [0], **options)
@@ -386,9 +377,6 @@ def test_outputs_and_starts_take_the_parameters_of_the_run():
     _, height, vx, vy = starts[1]
     expected = (vx**2 + vy**2 - G * height) / (2 * 0.75**2)
     np.testing.assert_allclose(problem.multipliers(0.0, starts[1], {l: 0.75}).values, [expected], rtol=1e-14)
-
-
-# Wrong input.
 
 
 def two_quantities(one, two):

@@ -166,9 +166,6 @@ def test_results_and_states_without_outputs(released):
             getattr(result, name)
 
 
-# Functions of users.
-
-
 def test_functions_may_change_their_arguments_and_return_the_same_array():
     kept = np.empty(1)
 
@@ -251,8 +248,6 @@ def test_a_start_is_found_and_what_is_set_is_not_moved():
     below = problem.start({"x": 0.6, "y": -0.5}, {"vx": 0.5}, independent=["x", "vx"])
     np.testing.assert_allclose(below, [0.6, -0.8, 0.5, 0.375], rtol=1e-14)
 
-
-# Energies.
 
 PENDULUM = {"constraints": length, "q0": [1, 0], "u0": [0, 0]}
 WITH_POTENTIAL = PENDULUM | {"potential_energy": potential}
@@ -358,9 +353,6 @@ def test_masses_that_the_constraints_make_positive():
     mechanism([1, 0], [0, -G], lambda t, q: [q[0] - q[1]], q0=[1, 1], u0=[0.5, 0.5])
     mechanism([1e3, 1e-3, 0], [0, -G, 0], lambda t, q: [q[1] - q[2]], q0=[1, 1, 1], u0=[0.5, 0.5, 0.5])
     mechanism([[1.0, 0.1 * 3], [0.3, 1.0]], [0, -G], q0=[1, 0], u0=[0, 0])
-
-
-# Mechanisms with known motions.
 
 
 def test_no_step_ends_next_to_a_singular_position():

@@ -35,9 +35,6 @@ def distance(problem, y, t):
     return np.linalg.norm((y - problem.reference(t))[:half].reshape(-1, 3), axis=1).max()
 
 
-# The problems.
-
-
 def test_pythagorean_energy_and_momentum():
     problem = pythagorean()
     energy, momentum = values(problem, problem.y0)
@@ -143,9 +140,6 @@ def test_pythagorean_to_its_end():
     plain = integrate(problem, invariants=(), **TIGHT)
     assert distance(problem, kept.y[:, -1], 70.0) < 5e-3
     assert distance(problem, plain.y[:, -1], 70.0) > 5 * distance(problem, kept.y[:, -1], 70.0)
-
-
-# Fictitious time.
 
 
 @pytest.mark.needs_jit

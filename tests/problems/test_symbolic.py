@@ -38,8 +38,6 @@ def values(problem, y):
     return out
 
 
-# The reader.
-
 VALUES = {
     "2*pi": 2 * math.pi, ".1 + .2": 0.3, "1e-3": 0.001, "2**0.5": math.sqrt(2), "-2**2": -4, "2 - 3 - 4": -5,
     "8/4/2": 1, "2**3**2": 512, "+1_000": 1000, "1 +\n 2": 3, "+".join(["1"] * 700): 700, "arcsin(1) - asin(1)": 0,
@@ -188,9 +186,6 @@ def test_parameters_by_name_in_runs(orbit):
     for y0, params in (([1.0, 0.0, 0.0], None), (np.ones(6), None), (np.ones(4), [1.0, 2.0]), (np.ones(4), [])):
         with pytest.raises(ValueError, match="must hold as many numbers as there are names in"):
             integrate(orbit, (0, 1), y0, params=params, method=EIPRK4, h=0.1)
-
-
-# Equations, energies, gradients.
 
 
 def test_nystrom_and_multistep_methods_take_it(orbit):

@@ -25,9 +25,6 @@ from eip_scipy.checkpoint import CheckpointError
 Y0 = pericentre(0.6)
 
 
-# Resuming, bit for bit.
-
-
 def crossing(t, y):
     return y[1]
 
@@ -124,9 +121,6 @@ def test_a_failed_run_fails_again(tmp_path):
     same(failed, run(fun=fun, checkpoint=path, resume=True))
     # And succeeds where the reason has gone.
     same(run(), run(checkpoint=path, resume=True))
-
-
-# When checkpoints are written.
 
 
 def test_checkpoint_every(tmp_path, times_written):
@@ -267,9 +261,6 @@ def test_other_versions_are_a_warning(old_run, tmp_path, monkeypatch):
     same(old_run[0], found)
 
 
-# The file.
-
-
 def test_header_and_arrays(tmp_path):
     path = tmp_path / "a.npz"
     arrays = {
@@ -303,9 +294,6 @@ def test_header_and_arrays(tmp_path):
             os.utime(tmp_path / name, (time.time() - 4000,) * 2)
     checkpoint.write(path, {"kind": "test"}, {})
     assert {entry.name for entry in tmp_path.iterdir()} == {"a.npz", *names[1:]}
-
-
-# Damage.
 
 
 def small_file(path):
@@ -417,9 +405,6 @@ def test_foreign_archives(tmp_path):
         archive.writestr("header.json", bytes(10**7))
     with pytest.raises(CheckpointError, match="compressed"):
         checkpoint.read(path)
-
-
-# Disks that are full.
 
 
 class FullDisk(io.FileIO):

@@ -42,9 +42,6 @@ def run(t_span=(0, 1), y0=Y0, fun=oscillator, **options):
     return integrate(fun, t_span, y0, **{"method": EIPRK4, "h": 0.1, **options})
 
 
-# Saved states.
-
-
 @pytest.mark.parametrize("t_span", [(0.0, 1.0), (1.0, 0.0)])
 def test_save_every(t_span):
     every = run(t_span, save_every=1, invariants=SQUARE)
@@ -76,9 +73,6 @@ def test_an_autonomous_system_does_not_see_the_time(method, how):
         np.testing.assert_array_equal(members.y[3], far.y[:, -1])
 
 
-# Interpolation.
-
-
 @pytest.mark.parametrize("t_span", [(0.0, 1.0), (1.0, 0.0), (-0.3, 0.75)])
 def test_t_eval_meets_both_ends_exactly(t_span):
     times = np.linspace(*t_span, 23)
@@ -91,9 +85,6 @@ def test_t_eval_meets_both_ends_exactly(t_span):
     alone = run(t_span, t_eval=[inside], invariants=SQUARE)
     np.testing.assert_array_equal(alone.y[:, 0], result.y[:, 10])
     assert (alone.t.tolist(), alone.status, alone.nfev) == ([inside], 0, run(t_span, invariants=SQUARE).nfev)
-
-
-# The callback.
 
 
 @pytest.mark.parametrize(
@@ -136,9 +127,6 @@ def test_a_callback_at_every_step(options):
             run((0, math.inf), **without)
 
 
-# Parameters and problems.
-
-
 def test_params_reach_every_function():
     seen = set()
 
@@ -174,8 +162,6 @@ def test_problem_s_metric_blocks_and_frame_are_used():
             integrate(problem, method=EIPRK4, **{name: None}).y, run(h=0.25, invariants=SQUARE).y
         )
 
-
-# Counts.
 
 F_SQUARE = Invariant(lambda t, y: y @ y, lambda t, y, f: 2 * np.array([-f[1], f[0]]), uses_f=True, name="S")
 N, WIDE = 10, 0.3
@@ -224,9 +210,6 @@ def test_counts_of_spaced_projections():
         assert result.nfev == 1 + 4 * N + (0 if reuse else projected)
 
 
-# Diagnostics.
-
-
 def test_diagnostics_are_filled():
     diagnostics = Diagnostics()
     result = run(invariants=[SQUARE, PAIR], diagnostics=diagnostics, save_every=1)
@@ -256,9 +239,6 @@ def test_max_residual_is_that_of_the_steps():
     assert seldom[0] == seldom[1]
 
 
-# Compensation.
-
-
 def round_off(h, steps, **options):
     """Error of RK4 on the oscillator against its own map, R(-ih)^N, in 40 digits: round-off alone."""
     with mpmath.workdps(40):
@@ -279,9 +259,6 @@ def test_compensation_in_five_thousand_steps(h):
     plain, compensated = (round_off(h, 5_000, compensated=c) for c in (False, True))
     assert compensated < 2e-16
     assert plain > 5 * compensated
-
-
-# Gradients that are computed.
 
 
 def same_as_by_gradient(value, y0, **options):

@@ -197,8 +197,6 @@ def test_an_invariant_that_raises_ends_the_run_with_its_error(how):
     assert 0.4 <= caught.value.partial.t[-1] <= 0.6
 
 
-# Values that change on the way.
-
 CHANGES = {
     "complex": (lambda y: y + 0j, "complex"),
     "text": (lambda y: "1.0", "'1.0'"),
@@ -223,9 +221,6 @@ def test_values_that_change():
                 how(**options)
             assert re.search(r"at t=0\.5\b", str(info.value))
             assert how is scipy_s or info.value.partial.t[-1] == 0.4
-
-
-# Exceptions before the first step.
 
 
 class MineError(Exception):

@@ -141,9 +141,6 @@ def test_invariants_of_several_values(c, options):
     assert one.max_residual.max() < 1e-10
 
 
-# Ways to hand them over.
-
-
 def declared(name):
     return f"int {name}(double, const double *, double *, const double *);"
 
@@ -189,9 +186,6 @@ def test_the_run_holds_the_only_reference():
         np.testing.assert_allclose(run.y, plain.y, atol=1e-5)
         assert run.compiled
         assert run.max_residual[0] < 1e-14
-
-
-# Statuses.
 
 
 NAMES = ["fun", "invariant 'S'", "gradient of invariant 'S'", "event 0"]
@@ -276,9 +270,6 @@ def test_a_shorter_step_may_have_a_value(c, compiled):
     same(run, integrate(c.decay, (0, 1), [1.0], **options | {"compiled": not compiled}))
 
 
-# Refused functions.
-
-
 def refused(c):
     """Return functions given as fun, with the text of the error."""
     arrays = [NUMBERS] * 3
@@ -331,9 +322,6 @@ def test_they_do_not_pickle(c):
         pickle.dumps(kept)
 
 
-# Events.
-
-
 def nearest(t, y, p):
     return y[0] * y[2] + y[1] * y[3]
 
@@ -378,9 +366,6 @@ def test_events_in_python_beside_native_functions(c, options, alone):
     assert set(kinds.values()) == {"pointer"}
     with pytest.raises(TypeError, match="is not a Numba function"):
         integrate(**given, **options, compiled=True)
-
-
-# Ensembles and checkpoints.
 
 
 def test_members_are_single_runs(c):

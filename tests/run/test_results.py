@@ -59,9 +59,6 @@ def untrusted_run():
     return run
 
 
-# Names.
-
-
 def test_component_names():
     assert integrate(oscillator, (0, 1), Y0, method=EIPRK4, h=0.1).component_names == ("y0", "y1")
     run = kepler_run()
@@ -80,9 +77,6 @@ def test_wrong_names():
             ({"names": 4}, TypeError, "sequence of strings, got 4"),
         ]
         refuse(partial(table, kepler_run()), rows)
-
-
-# Tables.
 
 
 def test_to_xarray():
@@ -184,9 +178,6 @@ def test_a_missing_library_is_named_with_its_extra(table, library, monkeypatch):
         getattr(kepler_run(), table)()
 
 
-# Files.
-
-
 def assert_same(one, other):
     same_fields(one, other, but=["diagnostics", "sol", "what"])
     assert repr(one.get("what")) == repr(other.get("what"))
@@ -256,16 +247,10 @@ def test_a_failed_save_leaves_the_file_that_was_there(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == [path]
 
 
-# Pickles.
-
-
 def test_results_pickle():
     again = pickle.loads(pickle.dumps(run := kepler_run()))
     assert_same(run, again)
     refuse(again.continue_to, [({"t": 10}, ValueError, "does not know its functions")])
-
-
-# Continued runs.
 
 
 @pytest.mark.parametrize(
@@ -383,9 +368,6 @@ def test_an_interrupted_run_goes_on_and_what_breaks_it_off_again_keeps_both():
     np.testing.assert_array_equal(both.y[:, : partial.t.size], partial.y)
     assert not both.trusted
     assert "up to t=0.6 did not end regularly: interrupted by Key" in partial.continue_to(3.0).message
-
-
-# Figures.
 
 
 def axes_of(figure):

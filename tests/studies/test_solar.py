@@ -84,9 +84,6 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
     assert {name: (folder / name).read_bytes() for name in before} == before
 
 
-# Epochs.
-
-
 @pytest.mark.parametrize(
     ("text", "julian_date"),
     [
