@@ -131,10 +131,9 @@ CASES = {
     "RKN12": (EIPRKN12, {"rtol": 1e-11, "atol": 1e-13, "max_step": 0.5}),
     "RKN8": (EIPRKN8, {"h": 0.1, "every": "auto", "compensated": True}),
     "GJ12": (EIPGJ12, {"h": 0.02}),
-    "balance": (
-        EIPDOP853,
-        {"rtol": 1e-10, "atol": 1e-12, "invariants": Balance(energy, grad=KEPT.grad, name="energy")},
-    ),
+    "balance": (EIPDOP853, {"rtol": 1e-10, "atol": 1e-12, "invariants": Balance(energy, grad=KEPT.grad, name="H")}),
+    "Radau": (EIPRadau, {"rtol": 1e-10, "atol": 1e-12}),
+    "BDF": (EIPBDF, {"rtol": 1e-10, "atol": 1e-12}),
 }
 
 

@@ -208,19 +208,6 @@ def test_a_failed_projection_takes_the_step_back_and_halves_it(method):
 
 
 @both
-def test_what_is_set_between_two_steps_is_taken(method):
-    solver = method(relaxing, 0.0, START, 5.0, **KEEP)
-    for _ in range(20):
-        solver.step()
-    solver.y = exact(1.0)
-    solver.t, solver.t_bound = 1.0, 2.0
-    while solver.status == "running":
-        solver.step()
-    assert solver.t == 2.0
-    assert abs(solver.y - exact(2.0))[:2].max() < 1e-4
-
-
-@both
 def test_options_of_the_projection(method):
     given = [{"every": 3}, {"every": "auto"}, {"iterations": 2}, {"direction": "midpoint"}, {"blocks": 2}]
     for options in (*given, {"metric": "euclidean"}, {"metric": [1, 1, 0, 0]}):

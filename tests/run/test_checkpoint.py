@@ -76,16 +76,11 @@ def test_broken_off_inside_a_step(case, tmp_path):
         partial = info.value.partial
         np.testing.assert_array_equal(partial.t[:-1], whole.t[: partial.t.size - 1])
         found = run(resume=True, **options)
-        step = checkpoint_step(info.value)
+        (note,) = info.value.__notes__
+        step = int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
         assert found.message.startswith(f"reached the end of the interval (resumed at step {step}")
         assert step > 0 or last == 9
         same(whole, found)
-
-
-def checkpoint_step(error):
-    """Return the step that the note of an exception names."""
-    (note,) = error.__notes__
-    return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
 
 
 @pytest.mark.usefixtures("fine")
@@ -166,15 +161,8 @@ def test_options_and_places(tmp_path, monkeypatch):
     same(run(), new)
 
 
-OTHERS = {
-    "method": EIPRK5,
-    "h": 0.02,
-    "rtol": 1e-4,
-    "invariants": [H],
-    "metric": "euclidean",
-    "blocks": 2,
-    "linear_invariants": FRAME,
-}
+OTHERS = {"method": EIPRK5, "h": 0.02, "rtol": 1e-4, "invariants": [H], "metric": "euclidean", "blocks": 2}
+OTHERS |= {"linear_invariants": FRAME}
 OTHERS |= {"direction": "midpoint", "iterations": 2, "every": 2, "reuse_f": False, "compensated": True, "save_every": 8}
 OTHERS |= {"events": crossing, "y0": pericentre(0.5), "t_span": (0, 7)}
 
@@ -330,13 +318,13 @@ def test_mutations(data, tmp_path):
     assert outcome(path) in (known, "refused")
 
 
-def forged(path, name, member, header=None):
+HEADER = {"format": "eip_scipy checkpoint", "schema": 1}
+
+
+def forged(path, name, member, **header):
     """Write a file with the given bytes of one member and the header."""
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(
-            "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [name[:-4]], **(header or {})}),
-        )
+        archive.writestr("header.json", json.dumps(HEADER | {"arrays": [name[:-4]]} | header))
         archive.writestr(name, member)
 
 
@@ -381,17 +369,14 @@ def test_foreign_archives(tmp_path):
         (old.getvalue(), {}, r"x\.npy does not have version 1\.0 of the npy format"),
     ]
     for member, header, words in rows:
-        forged(path, "x.npy", member, header)
+        forged(path, "x.npy", member, **header)
         refuse(checkpoint.read, [({"path": path}, CheckpointError, words)])
     np.savez(path, x=np.arange(3))
     with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: .* its members are \['x\.npy'\]"):
         checkpoint.read(path)
     # Members of the same bytes: 40 arrays of 1 kB in a file of a few.
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(
-            "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [f"x{k}" for k in range(40)]}),
-        )
+        archive.writestr("header.json", json.dumps(HEADER | {"arrays": [f"x{k}" for k in range(40)]}))
         archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
         first = archive.filelist[-1]
         for k in range(1, 40):

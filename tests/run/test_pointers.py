@@ -26,6 +26,16 @@ Y0, MU = np.array([1.6, 0.0, 0.0, 0.5]), [1.0]
 GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
 
 
+def circle(t, y, out, params):
+    out[0], out[1] = y[1], -y[0]
+    return 0
+
+
+def square(t, y, value, params):
+    value[0] = y[0] * y[0] + y[1] * y[1]
+    return 0
+
+
 def twice(t, y, f, out, params):
     out[0], out[1] = 2 * y[0], 2 * y[1]
     return 0
@@ -163,15 +173,6 @@ def test_all_kinds_of_pointers(c, library):
 
 def test_the_run_holds_the_only_reference():
     """The user's references to the function are gone with its ctypes object, or with that of cffi."""
-
-    def circle(t, y, out, params):
-        out[0], out[1] = y[1], -y[0]
-        return 0
-
-    def square(t, y, value, params):
-        value[0] = y[0] * y[0] + y[1] * y[1]
-        return 0
-
     ffi = cffi.FFI()
     made = {
         "ctypes": lambda: value(circle),
@@ -241,16 +242,7 @@ def test_no_value(c, k, compiled):
 def test_a_negative_status_between_the_steps(compiled):
     """The function is called when dense output is evaluated, after the run."""
     status = 0
-
-    def circle(t, y, out, params):
-        out[0], out[1] = y[1], -y[0]
-        return 0
-
-    def square(t, y, value, params):
-        value[0] = y[0] * y[0] + y[1] * y[1]
-        return status
-
-    kept = Invariant(value(square), gradient(twice), name="S")
+    kept = Invariant(value(lambda *given: square(*given) or status), gradient(twice), name="S")
     options = {"method": EIPRK4, "h": 0.1, "dense_output": True, "compiled": compiled}
     run = integrate(value(circle), (0, 1), [1, 2], invariants=kept, **options)
     assert run.compiled == compiled
@@ -322,10 +314,7 @@ def test_they_do_not_pickle(c):
         pickle.dumps(kept)
 
 
-def nearest(t, y, p):
-    return y[0] * y[2] + y[1] * y[3]
-
-
+nearest = partial(turn)
 nearest.direction, nearest.terminal = 1, 3
 
 
