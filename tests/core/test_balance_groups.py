@@ -351,14 +351,10 @@ def run(balances=KEPT, **options):
     return integrate(PROBLEM, invariants=balances, **options)
 
 
-def braked(t, y):
-    return -DRAG * momentum(t, y)
-
-
 def pair(**how):
     return [
         Balance(energy, loss, energy_gradient, name="E", **how),
-        Balance(momentum, braked, momentum_gradient, name="L", **how),
+        Balance(momentum, lambda t, y: -DRAG * momentum(t, y), momentum_gradient, name="L", **how),
     ]
 
 

@@ -139,16 +139,8 @@ def test_helpers_keep_what_they_are_given():
 # Functions in place that do not fill.
 
 
-def returning(t, y, out):
-    return np.array([y[1], -y[0]])
-
-
 def half(t, y, out):
     out[0] = y[1]
-
-
-def nothing(t, y, out):
-    pass
 
 
 def adding(t, y, out):
@@ -157,9 +149,9 @@ def adding(t, y, out):
 
 
 NOT_FILLING = [
-    (returning, TypeError, r"returned array\(.*must fill its argument out"),
+    (lambda t, y, out: np.array([y[1], -y[0]]), TypeError, r"returned array\(.*must fill its argument out"),
     (half, ValueError, "does not fill all of its argument out, in component 1"),
-    (nothing, ValueError, "does not fill all of its argument out, in component 0"),
+    (lambda t, y, out: None, ValueError, "does not fill all of its argument out, in component 0"),
     (adding, ValueError, "reads its argument out, whose content is arbitrary, before filling it, in component 0"),
 ]
 
