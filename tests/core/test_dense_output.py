@@ -64,11 +64,6 @@ def solved(method, variant):
     return solve(method, **VARIANTS[variant], dense_output=True)
 
 
-def items_of(variant):
-    given = VARIANTS[variant]["invariants"]
-    return [given] if isinstance(given, Invariant) else given
-
-
 # At the steps, between them, beyond them.
 
 
@@ -78,7 +73,8 @@ def test_steps_and_what_is_between_and_beyond_them(method, variant):
 
     The level is linear between the residuals at a step's ends, whatever they are.
     """
-    items, sol = items_of(variant), solved(method, variant)
+    items, sol = VARIANTS[variant]["invariants"], solved(method, variant)
+    items = [items] if isinstance(items, Invariant) else items
     assert sol.status == 0
     assert len(sol.t) > 5
     np.testing.assert_array_equal(np.array([sol.sol(t) for t in sol.t]).T, sol.y)
@@ -136,10 +132,6 @@ def thresholds(sol, shifts, components=(0, 2), most=10):
     return [(i, sol.y[i, k].real * (1 + shift)) for k in steps for i in components for shift in shifts]
 
 
-def passing(component, value):
-    return lambda t, y: y[component].real - value
-
-
 SHIFTS = (0.0, EPS, -EPS, 1e-13, -1e-13, 1e-9, -1e-9, 1e-6, -1e-6, 5e-5, -5e-5)
 LEVELS = {"default": {}, "backward": {"t_span": (8.0, 0.0)}, "every 3": {"every": 3}, "reuse_f off": {"reuse_f": False}}
 
@@ -154,7 +146,7 @@ def test_adversarial_thresholds(method, kind, rtol):
     options = {"invariants": [H, L], "rtol": rtol, "atol": rtol * 1e-3, **LEVELS[kind]}
     sol = solve(method, **options)
     cases = thresholds(sol, SHIFTS)
-    found = solve(method, **options, events=[passing(*case) for case in cases])
+    found = solve(method, **options, events=[lambda t, y, i=i, value=value: y[i].real - value for i, value in cases])
     np.testing.assert_array_equal(found.y, sol.y)
     assert sum(len(t) > 0 for t in found.t_events) >= 57
     # The steps' own level: what they have left of the invariants (unprojected ones, of every k-th, included).

@@ -57,14 +57,8 @@ def late(t, y):
     return np.array([y[1], -y[0]])
 
 
-@njit
-def shrinks(t, y):
-    return np.array([y[1], -y[0]]) if t < 1.0 else np.array([y[1]])
-
-
-@njit
-def divides(t, y):
-    return np.array([1.0 / (y[0] - y[0] * (t > 1.0)), -y[0]])
+shrinks = njit(lambda t, y: np.array([y[1], -y[0]]) if t < 1.0 else np.array([y[1]]))
+divides = njit(lambda t, y: np.array([1.0 / (y[0] - y[0] * (t > 1.0)), -y[0]]))
 
 
 @pytest.mark.parametrize("fun", [late, shrinks, divides])

@@ -7,18 +7,7 @@ import pytest
 from numba import njit
 from systems import jit_oscillator
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPGJ14,
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN8,
-    EIPRKN12,
-    ensemble,
-    integrate,
-)  # fmt: skip
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, EIPRKN12, ensemble, integrate
 from eip_scipy.ensembles import members as running
 from eip_scipy.problems import harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody

@@ -117,15 +117,11 @@ def mirror_jacobian(x, y, z):
     return (0.0, -b, -y * z), (b, 0.0, x * z), (0.0, 0.0, 0.0)
 
 
-def plain_a(x, y, z):
-    return [-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0]
-
-
-def plain_well(x, y, z):
-    return 0.05 * (x * x + y * y) * (1 + z)
-
-
-PLAIN = ParticleField(plain_a, potential=plain_well, axisymmetric=True)
+PLAIN = ParticleField(
+    lambda x, y, z: [-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0],
+    potential=lambda x, y, z: 0.05 * (x * x + y * y) * (1 + z),
+    axisymmetric=True,
+)
 WHOLE = ParticleField(mirror_a, mirror_jacobian, potential=well, electric=well_force, axisymmetric=True)
 MIRRORS = {  # field, form, names of what is kept
     "plain": (PLAIN, "canonical", "HL"),
@@ -231,10 +227,6 @@ def ring_a(t, x, y, z):
     return -around * y, around * x, 0.0
 
 
-def ring_b(t, x, y, z):
-    return 0.0, 0.0, (1 + 1e-4 * t) * (1 + x * x + y * y)
-
-
 def ring_phi(t, x, y, z):
     return 0.02 * (1 + 5e-4 * t) * (x * x + y * y)
 
@@ -245,8 +237,9 @@ def ring_e(t, x, y, z):
 
 
 def ring(**options):
-    given = {"vector_potential": ring_a, "magnetic": ring_b, "electric": ring_e, "axisymmetric": True, "varies": True}
-    return ParticleField(**(given | options))
+    magnetic = lambda t, x, y, z: (0.0, 0.0, (1 + 1e-4 * t) * (1 + x * x + y * y))  # noqa: E731
+    given = {"vector_potential": ring_a, "magnetic": magnetic, "electric": ring_e, "axisymmetric": True}
+    return ParticleField(**(given | options), varies=True)
 
 
 def moving(field, balances=None, t_end=20.0, **options):

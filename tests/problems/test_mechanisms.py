@@ -296,10 +296,6 @@ def test_a_given_power_is_that_of_the_energy(jit):
 # Wrong input. Each row: some words, what differs from the pendulum, and the kind of error.
 
 
-def skewed(q):
-    return np.array([[1, q[0]], [0, 1]])
-
-
 def on_a_line(t, q):
     return [q[0] - 1]
 
@@ -313,7 +309,7 @@ WRONG = [
     ("t is the time", {"coordinates": "t x"}),
     ("t is the time", {"speeds": "t x"}),
     (r"entries \[0, 1\] and \[1, 0\] are 0.05 and 0.* only the diagonal", {"mass": [[1, 0.05], [0, 1]]}),
-    ("mass must be a symmetric matrix", {"mass": skewed}),
+    ("mass must be a symmetric matrix", {"mass": lambda q: np.array([[1, q[0]], [0, 1]])}),
     *(("mass must be positive for motions that the constraints allow", {"mass": mass, "constraints": None})
       for mass in ([1, -1e-9], [-1, -1], [[0, 1], [1, 0]])),
     # On the circle, at (1, 0), only the second component moves.

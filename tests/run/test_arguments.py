@@ -94,14 +94,8 @@ def test_one_array_is_params():
     np.testing.assert_array_equal(by_args.y, by_params.y)
 
 
-@njit
-def oscillator_of(t, y, p):
-    return np.array([y[1], -p[0] * y[0] / p[1]])
-
-
-@njit
-def oscillator_of_both(t, y, p, m):
-    return np.array([y[1], -p[0] * y[0] / m])
+oscillator_of = njit(lambda t, y, p: np.array([y[1], -p[0] * y[0] / p[1]]))
+oscillator_of_both = njit(lambda t, y, p, m: np.array([y[1], -p[0] * y[0] / m]))
 
 
 def test_other_arguments_are_python_s():

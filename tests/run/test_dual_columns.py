@@ -21,9 +21,7 @@ def CALL(state, out):
     f[0], f[1] = y[1], -math.sin(y[0])
 
 
-@njit
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
+pendulum = njit(lambda t, y: np.array([y[1], -np.sin(y[0])]))
 
 
 @njit

@@ -9,19 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 from systems import same
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRK23,
-    EIPRK45,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    ensemble,
-    integrate,
-)
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.methods import NystromTableau
 from eip_scipy.problems import kepler
 
@@ -41,19 +30,9 @@ NYSTROM = EIPRKN8, EIPRKN12
 PROBLEM = kepler(t_end=30.0)
 
 
-@njit
-def crossing(t, y, params):
-    return y[1]
-
-
-@njit
-def apsis(t, y, params):
-    return y[0] * y[2] + y[1] * y[3]
-
-
-@njit
-def clock(t, y, params):
-    return np.sin(3.0 * t + 0.1)
+crossing = njit(lambda t, y, params: y[1])
+apsis = njit(lambda t, y, params: y[0] * y[2] + y[1] * y[3])
+clock = njit(lambda t, y, params: np.sin(3.0 * t + 0.1))
 
 
 apsis.direction = 1.0
@@ -155,7 +134,7 @@ NYSTROM4 = NystromTableau(
 )
 
 
-@pytest.mark.parametrize("method", [EIPRK4, eip_method(NYSTROM4)])
+@pytest.mark.parametrize("method", [EIPRK4, eip_scipy.eip_method(NYSTROM4)])
 def test_interpolants_are_hermite_s(method):
     """Interpolation is SciPy's, by values and slopes at both ends; for Nystrom methods by accelerations too."""
     y0, params = PROBLEM.y0, PROBLEM.params

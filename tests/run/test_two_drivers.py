@@ -15,19 +15,8 @@ from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
 from systems import jit_orbit as fun
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPGJ14,
-    EIPRK2,
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN12,
-    Invariant,
-    ensemble,
-    integrate,
-)
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK2, EIPRK4, EIPRK5, EIPRK45, EIPRKN12, Invariant, ensemble
 
 pytestmark = pytest.mark.needs_jit
 
@@ -187,7 +176,7 @@ names = pytest.mark.parametrize(
 
 
 def run(name, **more):
-    return integrate(**USUAL | RUNS[name] | more)
+    return eip_scipy.integrate(**USUAL | RUNS[name] | more)
 
 
 @names
