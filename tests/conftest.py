@@ -40,13 +40,6 @@ def kernel() -> Path:
 
 
 @pytest.fixture
-def no_rebound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rebound", None)
-    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
-    monkeypatch.delattr("eip_scipy.integrations.rebound", raising=False)
-
-
-@pytest.fixture
 def in_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Vectorise the members of ensembles however little work they have."""
     monkeypatch.setattr("eip_scipy.ensembles.members.LEAST_WORK", 0.0)
@@ -57,11 +50,6 @@ def snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take a snapshot for the checkpoint after each chunk, which short runs would not reach."""
     monkeypatch.setattr("eip_scipy.run.resume.SNAPSHOT_SECONDS", 0.0)
     monkeypatch.setattr("eip_scipy.run.resume.LEAST_RATIO", 0.0)
-
-
-@pytest.fixture
-def no_plotting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 # Seconds that tests take, roughly.

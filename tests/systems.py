@@ -103,11 +103,6 @@ jit_oscillator = njit(oscillator)
 JIT_SQUARE = Invariant(njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y), name="S")
 
 
-# Two complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
-
-
-jit_spin = njit(lambda t, y: -1j * np.array([0.3 * y[1] + abs(y[0]) ** 2 * y[0], 0.3 * y[0] + 0.7 * y[1]]))
-jit_norm = njit(lambda t, y: abs(y[0]) ** 2 + abs(y[1]) ** 2)
 twice = njit(lambda t, y: 2 * y)
 
 

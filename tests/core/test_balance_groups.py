@@ -252,13 +252,10 @@ def test_a_fast_balance_is_pointed_out(solve):
     """Also if it is fast only at the end: the energy decays to that of its driving, whose rate is as large."""
 
     def run(end, damping, force):
-        def power(t, y):
-            return -damping * y[1] ** 2 + force * y[1] * np.cos(2 * t)
-
         def driven(t, y):
             return np.array([y[1], -y[0] - damping * y[1] + force * np.cos(2 * t)])
 
-        balance = Balance(slow_energy, power, name="E")
+        balance = Balance(slow_energy, lambda t, y: -damping * y[1] ** 2 + force * y[1] * np.cos(2 * t), name="E")
         return solve(driven, (0, end), [1.0, 0.3], method=EIPDOP853, h=0.3, invariants=balance)
 
     run(200, 0.02, 0.01)  # warnings are errors

@@ -1,6 +1,7 @@
 """Models of SymPy as mechanical systems: their equations, energies, momenta, inputs, parameters, and wrong input."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,16 +112,12 @@ def test_all_kinds_of_models_give_the_same_motion(make, speeds, says):
 
 
 def test_a_system_of_pydy_brings_constants_and_start():
-    model = parabola_by_lagrange()
-
-    class System:  # as PyDy's
-        eom_method, constants = model, WEIGHT
-        initial_conditions = {x: 1, y: 1, x.diff(): 0.5, y.diff(): 1.0}  # noqa: RUF012
-
-    assert mechanics(System()).parameters == {"m": 1, "g": G}
-    np.testing.assert_array_equal(mechanics(System()).y0, [1, 1, 0.5, 1])
+    start = {x: 1, y: 1, x.diff(): 0.5, y.diff(): 1.0}
+    system = SimpleNamespace(eom_method=parabola_by_lagrange(), constants=WEIGHT, initial_conditions=start)
+    assert mechanics(system).parameters == {"m": 1, "g": G}
+    np.testing.assert_array_equal(mechanics(system).y0, [1, 1, 0.5, 1])
     # A constant that is given goes before that of the model.
-    lighter = mechanics(System(), {"g": 1.0})
+    lighter = mechanics(system, {"g": 1.0})
     np.testing.assert_allclose(lighter.motion_at(0.0, lighter.y0)[2], -(4 * 0.25 + 2) / 5, rtol=1e-13)
 
 
@@ -270,13 +267,12 @@ def test_one_function_may_give_several_inputs():
         x.diff() ** 2 / 2 + y.diff() ** 2 / 2, [x, y], forcelist=[(point, push * FRAME.x + pull * FRAME.y)], frame=FRAME
     )
 
-    class System:  # as PyDy's, whose functions take (x, t)
-        eom_method, constants, initial_conditions = model, {}, {x: 0, y: 0, x.diff(): 0, y.diff(): 0}
-        specifieds = {(push, pull): lambda x, t: np.array([np.sin(t), x[2]])}  # noqa: RUF012
-
+    start = dict.fromkeys([x, y, x.diff(), y.diff()], 0)
+    system = SimpleNamespace(eom_method=model, constants={}, initial_conditions=start)  # as PyDy's
+    system.specifieds = {(push, pull): lambda x, t: np.array([np.sin(t), x[2]])}
     functions = lambda t, y: [np.sin(t), y[2]], lambda t, y: [np.sin(t), y[2]] if t < 9 else [0.0, 0.0]
     problems = [mechanics(model, {}, [0, 0], [0, 0], inputs={(push, pull): given}) for given in functions]
-    for problem in (*problems, mechanics(System())):
+    for problem in (*problems, mechanics(system)):
         found = problem.motion_at(0.5, np.array([0.3, 0.4, 0.1, 0.2]))
         np.testing.assert_allclose(found, [0.1, 0.2, np.sin(0.5), 0.1], rtol=1e-15)
 

@@ -33,12 +33,7 @@ def falling(t, y):
     return y[0]
 
 
-def third(t, y):
-    return y[1]
-
-
 falling.direction = -1
-third.terminal = 2
 
 
 FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))

@@ -27,8 +27,11 @@ def solar(folder, *words):
 
 
 @pytest.fixture
-def few_methods(no_rebound, monkeypatch):
+def few_methods(monkeypatch):
     """Run less than the command would: no REBOUND, no figures."""
+    monkeypatch.setitem(sys.modules, "rebound", None)
+    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
+    monkeypatch.delattr("eip_scipy.integrations.rebound", raising=False)
     monkeypatch.setattr(command, "FIGURES", ())
 
 
