@@ -97,12 +97,8 @@ def jit_energy_gradient(t, y):
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
 JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
 JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
-
-
 jit_oscillator = njit(oscillator)
 JIT_SQUARE = Invariant(njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y), name="S")
-
-
 twice = njit(lambda t, y: 2 * y)
 
 
@@ -116,12 +112,9 @@ def spin(t, y):
 SPIN_NORM = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="N")
 SPIN_START = np.array([0.8, 0.6j, 0.1 - 0.2j])
 
-
 # A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
 # Its energy is a balance, whose rate is given in several ways, or found.
 QUARTIC_PARAMS, QUARTIC_START = np.array([1e-3, 0.3]), np.array([1.0, 0.3])
-
-
 swinging = njit(lambda t, y, p: np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3]))
 
 
@@ -141,8 +134,6 @@ def quartic_rate_by_f(t, y, f, p):
 
 quartic_gradient_by_f = njit(lambda t, y, f, p: np.array([-f[1], f[0]]))
 quartic_pair = njit(lambda t, y, p: np.array([quartic_energy(t, y, p), 2 * quartic_energy(t, y, p)]))
-
-
 BALANCES = {
     "rate": Balance(quartic_energy, quartic_rate, quartic_gradient, name="H"),
     "f": Balance(quartic_energy, quartic_rate_by_f, quartic_gradient_by_f, name="H", uses_f=True),

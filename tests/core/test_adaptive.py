@@ -25,9 +25,6 @@ def run(fun=orbit, t_span=(0.0, 6.0), y0=Y0, **options):
     return integrate(fun, t_span, y0, **{"method": EIPRK45, **saved, **options})
 
 
-# Adaptive steps with projection work, and improve the results.
-
-
 @methods
 def test_invariants_are_kept(method):
     """No h is needed; residuals of O(h^(2p + 2)) are below the local error, far below the tolerance."""
@@ -147,9 +144,6 @@ def test_rtol_too_small_warns_as_scipy_s(driver, rtol):
     assert len(record) == 1
     assert record[0].filename == __file__ or "scipy" in record[0].filename
     np.testing.assert_array_equal(found.y, driver(orbit, rtol=np.maximum(rtol, 100 * EPS), **options).y)
-
-
-# Failures: rejected, retried, reported, everything kept.
 
 
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")  # nor is it

@@ -39,11 +39,6 @@ def dragged(t, y):
     return orbit(t, y) - DRAG * np.array([0.0, 0.0, y[2], y[3]])
 
 
-def smooth_energy(t, y):
-    """The energy, by a square root that takes complex steps."""
-    return 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)
-
-
 def loss(t, y):
     return -DRAG * (y[2] ** 2 + y[3] ** 2)
 
@@ -80,8 +75,6 @@ START = np.array([1.0, 0.3])
 SWING = Balance(swing_energy, swing_rate, swing_gradient, name="H")
 SWING_ALONE = Balance(swing_energy, grad=swing_gradient, name="H")
 DAMPED = Balance(slow_energy, damping, name="E")
-
-
 ivp = scipy.integrate.solve_ivp
 
 
@@ -127,7 +120,8 @@ def test_states_between_the_steps_lie_on_the_carried_value(run, balance):
 
 def test_balances_beside_invariants_and_several_at_once():
     def both(t, y):
-        return np.array([smooth_energy(t, y), y[0] * y[3] - y[1] * y[2]])
+        by_root = 0.5 * (y[2] ** 2 + y[3] ** 2) - 1 / np.sqrt(y[0] ** 2 + y[1] ** 2)  # which takes complex steps
+        return np.array([by_root, y[0] * y[3] - y[1] * y[2]])
 
     def rates(t, y, f):
         return np.array([loss(t, y), y[0] * f[3] - y[1] * f[2]])

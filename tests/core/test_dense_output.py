@@ -17,7 +17,6 @@ EPS = np.finfo(float).eps
 NIGHTLY = pytest.mark.nightly
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-
 Y0 = pericentre(0.6)
 I0 = np.array([energy(0, Y0), momentum(0, Y0)])
 COMPLEX = {"invariants": SPIN_NORM, "fun": spin, "y0": SPIN_START}
@@ -62,9 +61,6 @@ def solve(method, **options):
 def solved(method, variant):
     """Return a run whose dense output several tests use."""
     return solve(method, **VARIANTS[variant], dense_output=True)
-
-
-# At the steps, between them, beyond them.
 
 
 @pytest.mark.parametrize(("method", "variant"), CASES)

@@ -14,7 +14,6 @@ TOLERANCE = 0.1
 
 # Two steps per method at which the next term of the error and round-off are both small.
 STEPS = {1: (512, 1024), 2: (256, 512), 3: (256, 512), 4: (200, 400), 5: (200, 400)}
-
 ERROR = {"metric": "error", "blocks": [[0, 1], [2, 3]]}  # position and velocity
 EUCLIDEAN = {"metric": "euclidean"}
 OPTIONS = {

@@ -19,10 +19,7 @@ OWN = {eip_method(cls.TABLEAU): theirs for cls, theirs in SCIPY.items()}
 LEVEL = dict.fromkeys(SCIPY, 1e-12) | dict(zip(OWN, (1e-9, 1e-6, 2e-3), strict=True))
 METHODS = SCIPY | OWN
 pairs = pytest.mark.parametrize("method", METHODS, ids=lambda m: m.__name__)
-
 KEPLER = orbit, (0.0, 20.0), pericentre(0.6)
-
-
 CASES = {
     "Kepler e=.6": KEPLER,
     "Kepler e=.9": (orbit, (0.0, 7.0), pericentre(0.9)),

@@ -131,9 +131,6 @@ def test_files_that_hold_no_ensemble(tmp_path):
         members(resume=True, checkpoint=place)
 
 
-# The time of writing, and disks that are full.
-
-
 def test_checkpoints_in_time(tmp_path):
     """Each chunk, if the seconds are over; a file that is read meanwhile is complete."""
     seen = []

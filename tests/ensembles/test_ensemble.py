@@ -66,9 +66,6 @@ def test_the_method_of_a_problem(own):
     np.testing.assert_array_equal(given.y, ensemble(kepler(), (0, 1), y0s).y)
 
 
-# Nothing passes from member to member, nor from worker to worker.
-
-
 @pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("more", [{}, {"save_every": 10, "reduce": lambda run: run.y.max(axis=1)}])
@@ -151,9 +148,6 @@ def test_members_in_columns_are_told():
     assert info.value.__notes__ == ["ensemble: the rows of y0s are members; y0s has 2 rows of 5 components."]
 
 
-# Chunks: callbacks, interruption, memory.
-
-
 def test_callback_sees_chunks_in_order_and_stops():
     seen = []
 
@@ -233,8 +227,6 @@ def test_bad_input():
 
 
 jit_leaves = njit(lambda t, y, params: y[0] + 0.5)
-
-
 jit_leaves.terminal = True
 
 

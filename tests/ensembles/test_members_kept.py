@@ -19,16 +19,12 @@ STEPS = {"method": EIPRK4, "h": 0.03}
 SPAN = (0.0, 8.0)
 
 
-def crossing(t, y, params):
-    return y[1]
-
-
 def far_out(t, y, params):
     return y[0] + 1.3
 
 
 far_out.terminal = 2
-EVENTS = [crossing, far_out]
+EVENTS = [lambda t, y, params: y[1], far_out]
 
 
 def pairs(run, **options):

@@ -69,7 +69,6 @@ class Case:
 
     @property
     def native(self):
-        """Return whether all functions are Numba functions."""
         return self.system.name == jitted.NAME
 
     def error(self, y):
@@ -77,7 +76,6 @@ class Case:
         return float(np.max(np.abs(y - self.truth) / self.size[:, None]))
 
     def solve_ivp(self, **options):
-        """Return the run by SciPy."""
         fun = counted(self.system.fun)
         given = {"invariants": self.invariants, **self.steps, **self.projection}
         if self.params is not None and not self.native:
@@ -100,12 +98,10 @@ class Case:
 
     @property
     def takes(self):
-        """Return the name of the argument for `fun`."""
         return "acceleration" if self.method in NYSTROM else "fun"
 
     @property
     def options(self):
-        """Return the options of both."""
         given = {
             "method": method(self.method),
             "invariants": self.invariants,
@@ -122,7 +118,6 @@ class Case:
         return given
 
     def integrate(self, **options):
-        """Return the run by `integrate`."""
         given = {self.takes: options.pop("fun", None) or self.fun, "t_span": self.t_span}
         return eip_scipy.integrate(**given, y0=self.system.y0.copy(), **self.options | options)
 
@@ -140,7 +135,6 @@ class Case:
 
 
 def method(name):
-    """Return the class of that name."""
     return getattr(eip_scipy, name)
 
 
@@ -164,8 +158,6 @@ def with_params(fun):
 
 
 def filling(fun):
-    """Return the function in place."""
-
     def fill(t, y, out, *params):
         out[:] = fun(t, y, *params)
 
@@ -173,7 +165,6 @@ def filling(fun):
 
 
 def random_case(seed):
-    """Return the case of that number."""
     rng = np.random.default_rng(seed)
     params, in_place, sick = None, False, False
     if rng.random() < 0.15:

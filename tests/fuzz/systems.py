@@ -82,7 +82,6 @@ class Runs:
 
     @property
     def checked(self):
-        """Return whether the run checks its invariants."""
         return bool(self.case.projection.get("check", True))
 
     @property
@@ -388,7 +387,6 @@ def look_at(seed):
 
 
 def main(arguments=None):
-    """Run the script; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.systems", description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this number of seconds")
     parser.add_argument("--count", type=int, default=None, help="stop after this number of systems")

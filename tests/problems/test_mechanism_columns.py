@@ -38,8 +38,6 @@ MOVING = {"constraints": lambda t, q: np.array([((q[0] - np.sin(t)) ** 2 + q[1] 
 SPHERE = {"constraints": lambda t, q: np.array([(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 - 1) / 2]), "u0": [0, 0.5, 0.3]}
 SKATE = {"velocity_constraints": lambda t, q, u: np.array([u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])])}
 SKATE |= {"q0": [0, 0, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.7]}
-
-
 PENDULUM = {"mass": [1.0], "forces": lambda t, q, u: np.array([-G * np.sin(q[0])]), "q0": [1.0], "u0": [0]}
 PENDULUM |= {"potential_energy": lambda t, q: -G * np.cos(q[0])}
 MASS = lambda q: np.array([[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]])  # noqa: E731

@@ -147,9 +147,6 @@ def test_piecewise_and_reciprocals_are_those_of_sympy():
         np.testing.assert_allclose(values(problem, point), expected, rtol=1e-14)
 
 
-# Names: those that are paired, and parameters.
-
-
 @pytest.mark.parametrize(
     ("H", "names"),
     [
@@ -389,9 +386,6 @@ def test_wrong_arguments(call):
         options = arguments[-1] if len(arguments) > 1 and isinstance(arguments[-1], dict) else {}
         with pytest.raises(kind, match=says):
             call(*arguments[: len(arguments) - bool(options)], **options)
-
-
-# Functions: jitted or not, in ensembles, in other processes.
 
 
 def test_cube_roots_are_real():

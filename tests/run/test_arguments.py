@@ -34,7 +34,6 @@ crosses.terminal, crosses.direction = 1, -1.0
 jit_oscillator, jit_energy, jit_gradient = njit(oscillator), njit(energy), njit(energy_gradient)
 jit_crosses = njit(crosses)
 jit_crosses.terminal, jit_crosses.direction = 1, -1.0
-
 PYTHON = oscillator, Invariant(energy, energy_gradient, name="H"), crosses
 JITTED = jit_oscillator, Invariant(jit_energy, jit_gradient, name="H"), jit_crosses
 NO_GRADIENT = jit_oscillator, Invariant(jit_energy, name="H"), jit_crosses

@@ -34,8 +34,6 @@ def falling(t, y):
 
 
 falling.direction = -1
-
-
 FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
 FIXED = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7}
 
@@ -123,9 +121,6 @@ def test_checkpoint_every(tmp_path, times_written):
     gaps = np.diff([t for t, _, _ in times_written(run, tmp_path / "c", 0.01, seconds=0.02)])[:-1]
     assert gaps.size > 3
     np.testing.assert_allclose(gaps, 0.425, atol=0.026)
-
-
-# Files that are there, that are not, and runs that do not fit.
 
 
 def test_options_and_places(tmp_path, monkeypatch):
@@ -403,21 +398,14 @@ class FullDisk(io.FileIO):
         return super().write(data)
 
 
-def fill_disk(patch, writes):
-    """From now on, fill the disk at the write of this number."""
-    room = [writes]
-    patch.setattr(
-        checkpoint, "open", lambda path, mode: io.BufferedWriter(FullDisk(path, mode, room), 16), raising=False
-    )
-    return room
-
-
 def test_a_full_disk_at_each_write(tmp_path, monkeypatch):
     path = tmp_path / "a"
     before, messages = small_file(path), set()
     for writes in range(1, 10**6):
         with monkeypatch.context() as patch:
-            room = fill_disk(patch, writes)
+            room = [writes]
+            full = lambda path, mode, room=room: io.BufferedWriter(FullDisk(path, mode, room), 16)  # noqa: E731
+            patch.setattr(checkpoint, "open", full, raising=False)
             try:
                 checkpoint.write(path, {"kind": "new"}, {"x": np.arange(100)})
                 break

@@ -318,9 +318,6 @@ def test_a_unitary_matrix_without_gradients():
     assert calls[0] < 2000  # differences take 192 for each gradient
 
 
-# check_gradient, the checks at the start, targets.
-
-
 WITH_ARGS = Invariant(lambda t, y, a: a * (y @ y), lambda t, y, a: 2 * a * y, args=(3.0,))
 IN_PLACE = Invariant(SQUARE.fun, lambda t, y, out: np.multiply(2, y, out=out), in_place=True)
 QUADRATIC = Invariant(lambda t, y: y[0] ** 2 + 3 * y[1] ** 2 + y[0], lambda t, y: np.array([2 * y[0] + 1, 6 * y[1]]))

@@ -204,9 +204,6 @@ def test_one_holder_at_any_time(tmp_path):
     assert content(tmp_path) == []
 
 
-# SIGTERM.
-
-
 @posix
 @pytest.mark.parametrize("keep", [kept_by_integrate, kept_by_ensemble])
 def test_sigterm(keep, tmp_path):

@@ -52,9 +52,6 @@ all_of_them = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled
 KEPT = Invariant(square, square_gradient, name="S")
 
 
-# Functions that write to what they are given.
-
-
 def writing_now_and_then(t, y):
     if t > 0.55:
         y[:] = 7.0 * y
@@ -134,9 +131,6 @@ def test_helpers_keep_what_they_are_given():
     np.testing.assert_array_equal(result.y, project(y, Invariant(square, square_gradient, target=5.1)).y)
     assert check_gradient(writer, 0.0, y, writing_by_a_function) < 1e-9
     np.testing.assert_array_equal(y, Y0)
-
-
-# Functions in place that do not fill.
 
 
 def half(t, y, out):

@@ -70,9 +70,6 @@ def gradient(function):
     return LowLevelCallable(GRADIENT(function))
 
 
-# Functions in Python with the same arithmetic.
-
-
 def orbit(t, y, p):
     r2 = y[0] * y[0] + y[1] * y[1]
     r3 = r2 * math.sqrt(r2)
@@ -151,14 +148,10 @@ def test_invariants_of_several_values(c, options):
     assert one.max_residual.max() < 1e-10
 
 
-def declared(name):
-    return f"int {name}(double, const double *, double *, const double *);"
-
-
 def test_all_kinds_of_pointers(c, library):
     options = {"method": EIPRK4, "h": 0.05, "params": MU}
     ffi = cffi.FFI()
-    ffi.cdef(declared("kepler"))
+    ffi.cdef("int kepler(double, const double *, double *, const double *);")
     opened = ffi.dlopen(library)
     spaced = LowLevelCallable(opened.kepler, signature="int(double,const double*, double  *,double const *)")
     address = ctypes.cast(c.kepler.function, ctypes.c_void_p).value
@@ -262,14 +255,19 @@ def test_a_shorter_step_may_have_a_value(c, compiled):
     same(run, integrate(c.decay, (0, 1), [1.0], **options | {"compiled": not compiled}))
 
 
-def refused(c):
-    """Return functions given as fun, with the text of the error."""
+@cfunc("intc(f8, CPointer(f8), CPointer(f8), CPointer(f8))")
+def decay(t, y, out, params):
+    out[0] = -y[0]
+    return 0
+
+
+def test_refused_functions(c):
     arrays = [NUMBERS] * 3
     double = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double, *arrays)(lambda *arguments: 0.0)
     anything = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * 3)(lambda *a: 0)
     plain = c.kepler.function
     ffi = cffi.FFI()
-    return [
+    refused = [
         (plain, r"is a bare C function, .*; wrap it: scipy\.LowLevelCallable\(pointer\)"),
         (ctypes.CDLL(None).sin, "is a bare C function"),
         (ffi.callback("int(double, double *)")(lambda *a: 0), "is a bare C function"),
@@ -281,16 +279,7 @@ def refused(c):
         (LowLevelCallable(plain, ctypes.c_void_p(1)), "LowLevelCallable with user_data"),
         (ctypes.cast(plain, ctypes.c_void_p).value, "must be callable"),
     ]
-
-
-@cfunc("intc(f8, CPointer(f8), CPointer(f8), CPointer(f8))")
-def decay(t, y, out, params):
-    out[0] = -y[0]
-    return 0
-
-
-def test_refused_functions(c):
-    for fun, reason in refused(c):
+    for fun, reason in refused:
         with pytest.raises(TypeError, match=reason):
             integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
         for wrap in (lambda f: Invariant(f, c.kept_gradient), lambda f: Invariant(c.kept, c.kept, name="H")):

@@ -16,11 +16,7 @@ from eip_scipy.problems import nbody
 E = 0.6
 START = pericentre(E)
 END = 10 * np.pi  # five revolutions
-
-
 acceleration = njit(lambda t, q: -q / (q[0] ** 2 + q[1] ** 2) ** 1.5)
-
-
 KEPT = [Invariant(energy, name="H"), Invariant(momentum, name="L")]
 
 

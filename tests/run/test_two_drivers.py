@@ -111,8 +111,6 @@ Z0 = np.exp(1j * np.arange(7.0)) * (1.0 + 0.1 * np.arange(7.0))
 MASS = Invariant(mass, twice, name="mass")
 ENERGY = Invariant(lattice_energy, njit(lambda t, y, f: 2j * f), uses_f=True, name="energy")
 COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
-
-
 Y0 = pericentre(0.6)
 H_OF_F = Invariant(energy, njit(H_USES_F.gradient), uses_f=True, name="H")
 HL = Invariant(both, both_gradients, name="HL")

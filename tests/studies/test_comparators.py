@@ -15,8 +15,6 @@ from eip_scipy_studies.condensates.problems import plane_wave, rotating_packet, 
 SCHEMES = (schemes.crank_nicolson, schemes.linearly_implicit, schemes.sav_crank_nicolson)
 ORBIT, Y0 = pericentre(0.5), np.array([0.5, 1.0, 0.2, 0.3, -0.1, 0.25])
 OTHER = {"form": "drift-kick-drift"}
-
-
 kepler = njit(lambda t, q: -q / (q[0] ** 2 + q[1] ** 2) ** 1.5)
 scaled = njit(lambda t, q, params: -params[0] * q)
 

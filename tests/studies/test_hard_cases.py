@@ -1,6 +1,5 @@
 """The hard cases: gradients, invariance, final states, and the command ``eip-scipy hard-cases``."""
 
-import csv
 import json
 import math
 import pickle
@@ -8,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pages import read_rows
 from scipy.integrate import solve_ivp
 
 from eip_scipy import Invariant, check_gradient, recommend
@@ -84,8 +84,7 @@ def test_command_prints_and_writes(tmp_path, capsys):
     found = json.loads(file.read_text())
     assert (found["rtol"], found["atol"]) == (1e-9, pytest.approx(1e-12))
     assert [check["passed"] for check in found["checks"]] == [True, True, True, False, True]
-    with open(tmp_path / "hard-cases-EIPDOP853-error.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_rows(tmp_path / "hard-cases-EIPDOP853-error.csv")
     assert [row["case"] for row in rows] == few
     assert float(rows[1]["gain"]) == found["cases"][1]["gain"] < 1
     assert found["cases"][1]["rank_reduced"] > 100

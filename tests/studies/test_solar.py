@@ -1,12 +1,12 @@
 """``eip-scipy solar-system``: a short run with all of its files, stored states, checkpoints, epochs, force models."""
 
-import csv
 import json
 import math
 import sys
 from fractions import Fraction
 
 import pytest
+from pages import read_rows
 
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import command, cost, runs
@@ -21,8 +21,7 @@ def solar(folder, *words):
     status = main(["solar-system", *words, "--out", str(folder), "--json", str(folder / "run.json")])
     rows = {}
     for file in folder.glob("*.csv"):
-        with open(file, newline="") as stream:
-            rows[file.stem] = [{k: v for k, v in row.items() if "wall" not in k} for row in csv.DictReader(stream)]
+        rows[file.stem] = [{k: v for k, v in row.items() if "wall" not in k} for row in read_rows(file)]
     return status, rows
 
 
