@@ -40,13 +40,6 @@ def kernel() -> Path:
 
 
 @pytest.fixture
-def no_rebound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rebound", None)
-    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
-    monkeypatch.delattr("eip_scipy.integrations.rebound", raising=False)
-
-
-@pytest.fixture
 def in_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Vectorise the members of ensembles however little work they have."""
     monkeypatch.setattr("eip_scipy.ensembles.members.LEAST_WORK", 0.0)
@@ -57,11 +50,6 @@ def snapshots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take a snapshot for the checkpoint after each chunk, which short runs would not reach."""
     monkeypatch.setattr("eip_scipy.run.resume.SNAPSHOT_SECONDS", 0.0)
     monkeypatch.setattr("eip_scipy.run.resume.LEAST_RATIO", 0.0)
-
-
-@pytest.fixture
-def no_plotting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 # Seconds that tests take, roughly.
@@ -77,6 +65,11 @@ def leaves_slow_out(config: pytest.Config) -> bool:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     if leaves_slow_out(config):
         terminalreporter.write_line("slow tests were left out; to run them: python -m pytest -m slow")
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if item.get_closest_marker("nightly"):  # which is slow by definition
+        item.add_marker("slow")
 
 
 @pytest.hookimpl(trylast=True)  # of the tests that were chosen

@@ -1,5 +1,6 @@
-"""Numbers that pages of the documentation print in tables, for the tests that compute them again."""
+"""Numbers that pages of the documentation print in tables, for the tests that compute them again; CSV files."""
 
+import csv
 import re
 from decimal import Decimal
 from pathlib import Path
@@ -27,3 +28,8 @@ def assert_printed(cell, *values, round_off=0.0):
     for text, value in zip(numbers * (len(values) // len(numbers)), values, strict=True):
         unit = float(Decimal(1).scaleb(Decimal(text).as_tuple().exponent))
         assert abs(float(text) - value) <= 0.6 * unit or max(abs(value), float(text)) <= round_off, (cell, values)
+
+
+def read_rows(file):
+    """Return the rows of a CSV file as dictionaries."""
+    return list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))

@@ -19,7 +19,6 @@ MEMORY, LONG_MEMORY = 0.8, 0.999
 LEAST_SHIFT = 1e-12
 # The share of its terms that a given target may be missed by without a further Newton step, and their largest number.
 MOST_LEFT, FURTHER = 1e-9, 3
-
 Array = np.ndarray
 
 

@@ -85,9 +85,7 @@ def jit_orbit(t, y):
     return np.array([y[2], y[3], -y[0] / r3, -y[1] / r3])
 
 
-@njit
-def jit_energy(t, y):
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1])
+jit_energy = njit(lambda t, y: 0.5 * (y[2] * y[2] + y[3] * y[3]) - 1 / np.sqrt(y[0] * y[0] + y[1] * y[1]))
 
 
 @njit
@@ -99,28 +97,9 @@ def jit_energy_gradient(t, y):
 jit_momentum, jit_momentum_gradient = njit(momentum), njit(momentum_gradient)
 JIT_H = Invariant(jit_energy, jit_energy_gradient, name="energy")
 JIT_L = Invariant(jit_momentum, jit_momentum_gradient, name="momentum")
-
-
 jit_oscillator = njit(oscillator)
 JIT_SQUARE = Invariant(njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y), name="S")
-
-
-# Two complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
-
-
-@njit
-def jit_spin(t, y):
-    return -1j * np.array([0.3 * y[1] + abs(y[0]) ** 2 * y[0], 0.3 * y[0] + 0.7 * y[1]])
-
-
-@njit
-def jit_norm(t, y):
-    return abs(y[0]) ** 2 + abs(y[1]) ** 2
-
-
-@njit
-def twice(t, y):
-    return 2 * y
+twice = njit(lambda t, y: 2 * y)
 
 
 # Three complex amplitudes under a Hermitian matrix and a cubic phase, which keep their norm.
@@ -133,15 +112,10 @@ def spin(t, y):
 SPIN_NORM = Invariant(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y, name="N")
 SPIN_START = np.array([0.8, 0.6j, 0.1 - 0.2j])
 
-
 # A quartic oscillator whose stiffness varies slowly: amplitude and frequency of that are the parameters.
 # Its energy is a balance, whose rate is given in several ways, or found.
 QUARTIC_PARAMS, QUARTIC_START = np.array([1e-3, 0.3]), np.array([1.0, 0.3])
-
-
-@njit
-def swinging(t, y, p):
-    return np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3])
+swinging = njit(lambda t, y, p: np.array([y[1], -(1 + p[0] * np.sin(p[1] * t)) * y[0] - y[0] ** 3]))
 
 
 @njit
@@ -149,14 +123,8 @@ def quartic_energy(t, y, p):
     return 0.5 * y[1] ** 2 + 0.5 * (1 + p[0] * np.sin(p[1] * t)) * y[0] ** 2 + 0.25 * y[0] ** 4
 
 
-@njit
-def quartic_gradient(t, y, p):
-    return np.array([(1 + p[0] * np.sin(p[1] * t)) * y[0] + y[0] ** 3, y[1]])
-
-
-@njit
-def quartic_rate(t, y, p):
-    return 0.5 * p[0] * p[1] * np.cos(p[1] * t) * y[0] ** 2
+quartic_gradient = njit(lambda t, y, p: np.array([(1 + p[0] * np.sin(p[1] * t)) * y[0] + y[0] ** 3, y[1]]))
+quartic_rate = njit(lambda t, y, p: 0.5 * p[0] * p[1] * np.cos(p[1] * t) * y[0] ** 2)
 
 
 @njit
@@ -164,16 +132,8 @@ def quartic_rate_by_f(t, y, f, p):
     return y[1] * f[1] + (1 + p[0] * np.sin(p[1] * t)) * y[0] * f[0] + y[0] ** 3 * f[0] + quartic_rate(t, y, p)
 
 
-@njit
-def quartic_gradient_by_f(t, y, f, p):
-    return np.array([-f[1], f[0]])
-
-
-@njit
-def quartic_pair(t, y, p):
-    return np.array([quartic_energy(t, y, p), 2 * quartic_energy(t, y, p)])
-
-
+quartic_gradient_by_f = njit(lambda t, y, f, p: np.array([-f[1], f[0]]))
+quartic_pair = njit(lambda t, y, p: np.array([quartic_energy(t, y, p), 2 * quartic_energy(t, y, p)]))
 BALANCES = {
     "rate": Balance(quartic_energy, quartic_rate, quartic_gradient, name="H"),
     "f": Balance(quartic_energy, quartic_rate_by_f, quartic_gradient_by_f, name="H", uses_f=True),

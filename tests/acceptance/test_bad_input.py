@@ -13,22 +13,12 @@ from numba import njit
 from scipy.integrate import RK45, solve_ivp
 from systems import SQUARE, jit_oscillator, orbit, oscillator
 
-from eip_scipy import (
-    EIPRK1,
-    EIPRK3,
-    EIPRK4,
-    EIPRK45,
-    Invariant,
-    check_gradient,
-    ensemble,
-    integrate,
-    project,
-    recommend,
-)
+import eip_scipy
+from eip_scipy import EIPRK1, EIPRK3, EIPRK4, EIPRK45, Invariant, ensemble, integrate, project, recommend
 from eip_scipy.solvers import EIPSolver
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 Y0 = [1.0, 2.0]
 FIXED = {"method": EIPRK4, "h": 0.1}
 square, square_gradient = SQUARE.fun, SQUARE.grad
@@ -235,9 +225,6 @@ def check_refused(options, error, match):
     assert len(str(info.value)) < 400
 
 
-# The state and the right-hand side.
-
-
 @both
 def test_y0_without_masked_values_and_unchanged(driver):
     plain, unmasked = driver(), driver(y0=np.ma.array(Y0, mask=[False, False]))
@@ -307,9 +294,6 @@ def test_exceptions_of_the_user_pass_unchanged(part, error):
         assert info.value is error
 
 
-# The interval and the step.
-
-
 def test_times_of_the_solver_class():
     """A run from an infinite start never arrives; the end may be infinite, because a terminal event may end the run."""
     infinite = [(-math.inf, 0), (math.inf, math.inf), (math.nan, 1), (0, math.nan)]
@@ -356,9 +340,6 @@ def test_steps_end_on_t_bound(driver):
         sign = np.sign(span[1] - span[0])
         np.testing.assert_array_equal(run.t[:-1], span[0] + np.arange(n) * (sign * h))
         assert (sign * np.diff(run.t) > 1e-7 * h).all()
-
-
-# Tolerances and options.
 
 
 @both
@@ -414,9 +395,6 @@ def test_times_of_dense_output_are_real():
     assert sol([0, 1]).shape == (2, 2)
     with pytest.raises(TypeError, match="dense output is defined at real times, got"):
         by_scipy(t_eval=[0.5 + 0j], invariants=SQUARE)
-
-
-# Invariants.
 
 
 WRONG_INVARIANTS = [
@@ -520,7 +498,7 @@ def test_project_needs_f_where_a_gradient_uses_it():
         project([0.6, 0.81], kept, f=[1.0, 1.0], iterations=2)
     assert project([0.6, 0.81], kept, f=oscillator, iterations=3).residual[0] == pytest.approx(0, abs=4 * EPS)
     with pytest.raises(ValueError, match="pass fun="):
-        check_gradient(kept, 0.0, Y0)
+        eip_scipy.check_gradient(kept, 0.0, Y0)
 
 
 jit_value, jit_grad = njit(lambda t, y: y[0] * y[0] + y[1] * y[1]), njit(lambda t, y: 2 * y)

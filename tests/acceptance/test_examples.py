@@ -84,7 +84,6 @@ def test_low_orbit(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_balances(tmp_path):
     found = {line.split(":")[0]: numbers(line.partition("ratio")[2]) for line in printed("balances", tmp_path)}
@@ -110,7 +109,6 @@ def test_megno_map_is_that_of_rebound(tmp_path, points, revolutions):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_growth(tmp_path):
     pytest.importorskip("matplotlib")
     (line,) = (line for line in printed("growth", tmp_path) if line.startswith("EIPGJ14, balances"))

@@ -17,7 +17,7 @@ from scipy import integrate
 
 from eip_scipy import EIPBDF, EIPDOP853, EIPRK23, EIPRK45, EIPRadau, eip_method, solve_ivp
 
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 ALL = {"RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"}
 # The last explicit one is a tableau through `eip_method`, whose steps are always the package's own.
 EXPLICIT = {"EIPRK23": EIPRK23, "EIPRK45": EIPRK45, "EIPDOP853": EIPDOP853, "own RK45": eip_method(EIPRK45.TABLEAU)}

@@ -5,38 +5,14 @@ import warnings
 
 import numpy as np
 import pytest
+import systems
 from scipy.integrate import solve_ivp
-from systems import (
-    H_USES_F,
-    JIT_SQUARE,
-    SQUARE,
-    VOLTERRA,
-    H,
-    L,
-    energy,
-    energy_gradient,
-    jit_oscillator,
-    lotka_volterra,
-    orbit,
-    oscillator,
-    pericentre,
-)
+from systems import H_USES_F, JIT_SQUARE, SQUARE, VOLTERRA, H, L, energy, lotka_volterra, orbit, oscillator, pericentre
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK2,
-    EIPRK3,
-    EIPRK4,
-    EIPRK5,
-    EIPRK23,
-    EIPRK45,
-    Diagnostics,
-    Invariant,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Diagnostics, Invariant, integrate
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 METHODS = [EIPRK3, EIPRK4, EIPRK5, EIPRK23, EIPRK45, EIPDOP853]
 second_order = pytest.param(EIPRK2, marks=NIGHTLY)  # in thousands of steps
 methods = pytest.mark.parametrize("method", [second_order, *METHODS], ids=lambda m: m.__name__)
@@ -47,9 +23,6 @@ Y0 = pericentre(E)
 def run(fun=orbit, t_span=(0.0, 6.0), y0=Y0, **options):
     saved = {} if "t_eval" in options else {"save_every": 1}
     return integrate(fun, t_span, y0, **{"method": EIPRK45, **saved, **options})
-
-
-# Adaptive steps with projection work, and improve the results.
 
 
 @methods
@@ -96,6 +69,7 @@ def test_error_goes_with_the_tolerance(method):
     assert kept == pytest.approx(free, rel=0.2)
 
 
+OFF = Invariant(energy, systems.energy_gradient, target=-0.45)
 # The option, whether it changes the states, and the energy that is kept.
 OPTIONS = {
     "no invariants": ({"invariants": ()}, True, None),
@@ -117,11 +91,7 @@ OPTIONS = {
     "reuse_f": ({"reuse_f": False}, True, -0.5),
     "uses_f": ({"invariants": H_USES_F}, False, -0.5),
     "check": ({"check": False}, False, -0.5),
-    "project_initial": (
-        {"invariants": Invariant(energy, energy_gradient, target=-0.45), "project_initial": True},
-        True,
-        -0.45,
-    ),
+    "project_initial": ({"invariants": OFF, "project_initial": True}, True, -0.45),
     "first_step": ({"first_step": 0.01}, True, -0.5),
     "max_step": ({"max_step": 0.1}, True, -0.5),
 }
@@ -174,9 +144,6 @@ def test_rtol_too_small_warns_as_scipy_s(driver, rtol):
     assert len(record) == 1
     assert record[0].filename == __file__ or "scipy" in record[0].filename
     np.testing.assert_array_equal(found.y, driver(orbit, rtol=np.maximum(rtol, 100 * EPS), **options).y)
-
-
-# Failures: rejected, retried, reported, everything kept.
 
 
 @pytest.mark.filterwarnings("ignore:.*not to be trusted:eip_scipy.ProjectionWarning")  # nor is it
@@ -287,14 +254,11 @@ def test_nfev_is_the_number_of_calls(driver):
             assert found.nfev == len(calls), (method, options)
 
 
-# Memory, saving, progress.
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.needs_jit), False])
 def test_memory_bound_of_an_adaptive_run(compiled):
     """The number of steps is not known before: the run ends when the rows would outgrow the bound, with all of them."""
-    options = {"fun": jit_oscillator, "t_span": (0, 1e4), "y0": [1.0, 2.0], "invariants": JIT_SQUARE}
+    options = {"fun": systems.jit_oscillator, "t_span": (0, 1e4), "y0": [1.0, 2.0], "invariants": JIT_SQUARE}
     options |= {"compiled": compiled, "max_bytes": 8 * 4 * 3000}  # a row: time, two components, one invariant
     with pytest.raises(MemoryError, match="increase save_every or max_bytes") as caught:
         run(max_step=0.01, **options)

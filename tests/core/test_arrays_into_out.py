@@ -66,16 +66,8 @@ STAYS = [
     "for k in range(3):\n    out = np.empty(4)\n    out[:] = {}\n    if k > 1:\n        return out\nreturn y * {}",
     "keep = np.array([{}, {}, {}, {}])\nother = keep\nkeep = np.zeros(4)\nreturn other if t < 0 else keep",
 ]
-TERMS = [
-    "y[0]",
-    "y[1] * y[2]",
-    "y[3] - t",
-    "math.sin(y[1])",
-    "y[2] ** 2",
-    "1.0 / (1.0 + y[0] ** 2)",
-    "-y[3]",
-    "np.exp(y[1])",
-]
+TERMS = ["y[0]", "y[1] * y[2]", "y[3] - t", "math.sin(y[1])", "y[2] ** 2"]
+TERMS += ["1.0 / (1.0 + y[0] ** 2)", "-y[3]", "np.exp(y[1])"]
 
 
 def terms(rng):

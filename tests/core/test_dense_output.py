@@ -14,10 +14,9 @@ from eip_scipy import EIPDOP853, EIPRK2, EIPRK4, EIPRK5, EIPRK23, EIPRK45, Invar
 from eip_scipy.problems import solar_system
 
 EPS = np.finfo(float).eps
-NIGHTLY = [pytest.mark.nightly, pytest.mark.slow]
+NIGHTLY = pytest.mark.nightly
 PAIRS = [EIPRK23, EIPRK45, EIPDOP853]
 pairs = pytest.mark.parametrize("method", PAIRS, ids=lambda m: m.__name__)
-
 Y0 = pericentre(0.6)
 I0 = np.array([energy(0, Y0), momentum(0, Y0)])
 COMPLEX = {"invariants": SPIN_NORM, "fun": spin, "y0": SPIN_START}
@@ -64,21 +63,14 @@ def solved(method, variant):
     return solve(method, **VARIANTS[variant], dense_output=True)
 
 
-def items_of(variant):
-    given = VARIANTS[variant]["invariants"]
-    return [given] if isinstance(given, Invariant) else given
-
-
-# At the steps, between them, beyond them.
-
-
 @pytest.mark.parametrize(("method", "variant"), CASES)
 def test_steps_and_what_is_between_and_beyond_them(method, variant):
     """States at the steps are exact, on the level in between, and a function of the time alone.
 
     The level is linear between the residuals at a step's ends, whatever they are.
     """
-    items, sol = items_of(variant), solved(method, variant)
+    items, sol = VARIANTS[variant]["invariants"], solved(method, variant)
+    items = [items] if isinstance(items, Invariant) else items
     assert sol.status == 0
     assert len(sol.t) > 5
     np.testing.assert_array_equal(np.array([sol.sol(t) for t in sol.t]).T, sol.y)
@@ -130,17 +122,10 @@ def test_late_calls_do_not_disturb_a_running_solver(method, invariants):
         np.testing.assert_array_equal(piece(0.4 * piece.t_old + 0.6 * piece.t), y)
 
 
-# Events near the ends of steps.
-
-
 def thresholds(sol, shifts, components=(0, 2), most=10):
     """Return pairs (component, value): thresholds within some relative shifts of states at up to `most` steps."""
     steps = np.unique(np.linspace(1, len(sol.t) - 2, most).astype(int))
     return [(i, sol.y[i, k].real * (1 + shift)) for k in steps for i in components for shift in shifts]
-
-
-def passing(component, value):
-    return lambda t, y: y[component].real - value
 
 
 SHIFTS = (0.0, EPS, -EPS, 1e-13, -1e-13, 1e-9, -1e-9, 1e-6, -1e-6, 5e-5, -5e-5)
@@ -157,7 +142,7 @@ def test_adversarial_thresholds(method, kind, rtol):
     options = {"invariants": [H, L], "rtol": rtol, "atol": rtol * 1e-3, **LEVELS[kind]}
     sol = solve(method, **options)
     cases = thresholds(sol, SHIFTS)
-    found = solve(method, **options, events=[passing(*case) for case in cases])
+    found = solve(method, **options, events=[lambda t, y, i=i, value=value: y[i].real - value for i, value in cases])
     np.testing.assert_array_equal(found.y, sol.y)
     assert sum(len(t) > 0 for t in found.t_events) >= 57
     # The steps' own level: what they have left of the invariants (unprojected ones, of every k-th, included).
@@ -171,9 +156,6 @@ def test_adversarial_thresholds(method, kind, rtol):
         assert np.abs(y[:, i] - value).max(initial=0.0) <= 1e-11
         assert residuals(y.T).max(initial=0.0) <= max(level, 1e-14) * (1 + 1e-3) + 4e-15
         assert (np.diff(t) * np.sign(sol.t[-1] - sol.t[0]) >= 0).all()
-
-
-# Samples on the manifold.
 
 
 @pairs

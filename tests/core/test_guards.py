@@ -7,23 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from systems import PENDULUM_ENERGY, SQUARE, VOLTERRA, lotka_volterra, oscillator, pendulum
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ14,
-    EIPRK2,
-    EIPRK3,
-    EIPRK4,
-    EIPRK5,
-    EIPRK23,
-    EIPRK45,
-    EIPRKN12,
-    Balance,
-    Diagnostics,
-    Invariant,
-    ProjectionWarning,
-    integrate,
-    project,
-)
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPRK2, EIPRK3, EIPRK4, EIPRK5, EIPRK45, Balance, Invariant, integrate, project
 from eip_scipy.problems import kepler
 
 EPS = np.finfo(float).eps
@@ -43,10 +28,7 @@ def turning(**options):
 
 
 @metrics
-@pytest.mark.parametrize(
-    ("method", "h"),
-    [(EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK4, 0.03), (EIPRK5, 0.05)],
-)
+@pytest.mark.parametrize(("method", "h"), [(EIPRK2, 0.02), (EIPRK3, 0.02), (EIPRK4, 0.03), (EIPRK5, 0.05)])
 def test_circular_kepler(metric, method, h):
     """Truncation errors make parallel gradients nearly so: a poor correction does not end a correct run."""
     for eccentricity in (0.0, 1e-8, 1e-4):
@@ -67,7 +49,8 @@ def test_circular_kepler(metric, method, h):
 
 @pytest.mark.needs_jit
 @pytest.mark.parametrize(
-    ("method", "steps", "allowed"), [(EIPRKN12, 24, 5e-12), (EIPGJ14, 90, 1e-12), (EIPDOP853, 100, 1e-11)]
+    ("method", "steps", "allowed"),
+    [(eip_scipy.EIPRKN12, 24, 5e-12), (eip_scipy.EIPGJ14, 90, 1e-12), (EIPDOP853, 100, 1e-11)],
 )
 def test_nearly_parallel_gradients_do_not_amplify_rounding(method, steps, allowed):
     """The rounding errors of the residuals were divided by the sine of the angle between the gradients."""
@@ -129,12 +112,9 @@ def test_without_any_gradient_the_raw_state_stays(direction):
     np.testing.assert_array_equal(found.y, [[0.0] * 5, [3.0, 3.25, 3.5, 3.75, 4.0]])
     assert found.diagnostics.n_projections == found.diagnostics.n_rank_reduced == 4
     assert found.max_residual[0] == 1e-3
-    with pytest.warns(ProjectionWarning, match="left an error of -1 in 'S', 1 of the size of its terms"):
+    with pytest.warns(eip_scipy.ProjectionWarning, match="left an error of -1 in 'S', 1 of the size of its terms"):
         result = project([0.0, 0.0], SQUARE, target=1.0, iterations=3)
     assert (result.rank, *result.y, *result.correction, *result.residual) == (0, 0.0, 0.0, 0.0, 0.0, -1.0)
-
-
-# Units and amplitudes.
 
 
 @metrics
@@ -207,9 +187,6 @@ def test_row_inside_the_band_stays():
     assert abs(project([1.0, 0.0, 0.0], sphere).y.sum() - 1.0) > 1e-3
 
 
-# Duplicate and contradicting invariants.
-
-
 def test_contradicting_targets():
     """The worst one comes first, whatever the order: "a" is off by 0.995 of its size, "b" by 0.75."""
     a, b = (Invariant(SQUARE.fun, SQUARE.grad, target=x, name=name) for x, name in ((1000.0, "a"), (20.0, "b")))
@@ -265,7 +242,7 @@ INTERRUPTED = {
 @pytest.mark.parametrize("case", INTERRUPTED)
 def test_projection_that_fails_on_the_way(driver, iterations, case):
     invariants, words, rows = INTERRUPTED[case]
-    d = Diagnostics()
+    d = eip_scipy.Diagnostics()
     options = {"invariants": invariants, "iterations": iterations, "check": False, "h": 0.1, "diagnostics": d}
     with np.errstate(all="ignore"):
         found = driver(oscillator, (0, 1), [1.0, 2.0], method=EIPRK4, **options)
@@ -398,7 +375,7 @@ def test_what_is_left_may_not_exceed_the_residuals_of_all():
         project(np.zeros(3), bent([1e-3, 0.0, 0.0], 1e3, 1.0, along=0))
 
 
-@pytest.mark.parametrize("method", [EIPRK23, EIPRK45, EIPDOP853])
+@pytest.mark.parametrize("method", [eip_scipy.EIPRK23, EIPRK45, EIPDOP853])
 def test_targets_that_contradict_each_other_end_the_run(method):
     """With drag an orbit of this angular momentum has no such energy; steps of 1e-12 would stay near the targets."""
     drag, problem = 1e-3, kepler(0.0, relativistic=0.0)

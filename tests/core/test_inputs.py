@@ -14,7 +14,6 @@ from eip_scipy.problems import nbody
 units = pytest.importorskip("astropy.units")
 mpmath, sympy = pytest.importorskip("mpmath"), pytest.importorskip("sympy")
 Time = pytest.importorskip("astropy.time").Time
-
 Y0 = [1.0, 2.0]
 BODIES = {"gm": [1.0, 1e-3], "position": np.eye(2, 3), "velocity": np.eye(2, 3), "t_span": (0, 1)}
 

@@ -50,9 +50,6 @@ def test_a_function_stands_for_its_invariant_everywhere():
     np.testing.assert_allclose(run.invariants, 2.0, rtol=1e-12)  # the run's own arguments come last
 
 
-# Gradients that are not given.
-
-
 def wall(t, y):
     beyond = np.maximum(abs(y[0]) - 1, 0)
     return np.array([y[1], -y[0] - 150 * beyond**2 * np.sign(y[0])])
@@ -231,9 +228,6 @@ def test_single_precision_explains_no_friction():
     assert "'energy' is not an invariant of this system" in texts[0]
 
 
-# Times.
-
-
 @pytest.mark.parametrize("span", [(0.0, 1.0), (1.0, 0.0), (2.0, 2.0), (5.0, 5.001), (0.0, 1e-9)])
 def test_no_function_is_called_outside_the_interval(span):
     """Tables end where the run does."""
@@ -330,11 +324,7 @@ CONSTRAINED = {
     "four-bar, slanted": (FOUR_BAR, [0.6, 0.8, 1.6, 0.8, 0, 0, 0, 0]),
     "four-bar, flat": (FOUR_BAR, [1, 0, 2, 0, 0, 0, 0, 0]),
 }
-STEPS = {
-    "loose": (EIPRK45, {}),
-    "tight": (EIPDOP853, {"rtol": 1e-8, "atol": 1e-8}),
-    "fixed": (EIPRK4, {"h": 0.01}),
-}
+STEPS = {"loose": (EIPRK45, {}), "tight": (EIPDOP853, {"rtol": 1e-8, "atol": 1e-8}), "fixed": (EIPRK4, {"h": 0.01})}
 
 
 @pytest.mark.parametrize("name", CONSTRAINED)

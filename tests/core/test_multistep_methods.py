@@ -7,16 +7,7 @@ from closed_forms import kepler_state
 from scipy.integrate import solve_ivp
 from systems import JIT_H, JIT_L, orbit, pericentre
 
-from eip_scipy import (
-    EIPGJ12,
-    EIPGJ14,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    ensemble,
-    integrate,
-)
+from eip_scipy import EIPGJ12, EIPGJ14, EIPRKN8, EIPRKN12, Invariant, eip_method, ensemble, integrate
 from eip_scipy.methods import GaussJackson
 from eip_scipy.problems import solar_data, solar_system
 

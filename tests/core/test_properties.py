@@ -90,11 +90,6 @@ def test_order_of_invariants_and_components(seed, size, iterations):
     np.testing.assert_allclose(permuted[back], plain, rtol=0, atol=1e-11)
 
 
-def random_frame(rng, n, k):
-    C, S = rng.standard_normal((k, n)), rng.standard_normal((n, k))
-    return C, S, np.eye(n) - S @ np.linalg.solve(C @ S, C)
-
-
 @given(seeds, st.integers(2, 9), st.integers(1, 3), st.integers(0, 2))
 @few
 def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
@@ -103,7 +98,8 @@ def test_least_norm_in_the_metric_and_neutral_to_the_frame(seed, n, rows, k):
     rng = np.random.default_rng(seed)
     G, y_hat, sigma = rng.standard_normal((rows, n)), rng.standard_normal(n), 10.0 ** rng.uniform(-3, 0, n)
     target = G @ y_hat + rng.standard_normal(rows)
-    C, S, P = random_frame(rng, n, k)
+    C, S = rng.standard_normal((k, n)), rng.standard_normal((n, k))
+    P = np.eye(n) - S @ np.linalg.solve(C @ S, C)
     A = (G @ P) * sigma
     assume(np.linalg.cond(C @ S) < 100 if k else True)
     assume(np.linalg.cond(A / np.linalg.norm(A, axis=1, keepdims=True)) < 1e3)
@@ -173,9 +169,6 @@ def test_iterations_are_newton_s(seed, size, iterations):
     result = project(q.y_hat, q.invariant(), iterations=iterations)
     # Convergence squares the distance, so that a simplified Newton would be far off.
     np.testing.assert_allclose(result.y, y, rtol=0, atol=1e-13)
-
-
-# Complex states.
 
 
 class ComplexQuadratic:

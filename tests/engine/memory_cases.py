@@ -44,8 +44,7 @@ def cases(c):
     def turning(t, y):
         return [y[1], -y[0]]
 
-    compiled = jitted_call(library["eih.momentum"])
-
+    compiled, fixed = jitted_call(library["eih.momentum"]), {"method": EIPRK4, "h": 0.1}
     return {
         "pointers, fixed": (lambda: pointers(method=EIPRK4, h=0.02), True),
         "pointers, events": (lambda: pointers(method=EIPRK45, rtol=1e-8, events=c["turn"]), True),
@@ -53,7 +52,9 @@ def cases(c):
             lambda: integrate(c["decay"], (0, 1), [1.0], method=EIPRK45, params=[0.0], first_step=0.5).y, True,
         ),
         "Python": (lambda: integrate(turning, (0, 1), [1.0, 0.0], method=EIPRK45, invariants=square).y, False),
-        "Python, samples": (lambda: sampled(turning, square), False),
+        "Python, samples": (
+            lambda: integrate(turning, (0, 1), [1.0, 0.0], t_eval=[0.15, 0.3], invariants=square, **fixed).y, False,
+        ),
         "multistep": (lambda: integrate(problem, (0, 2), method=EIPGJ12, h=0.005, t_eval=[0.301, 0.7017]).y, True),
         "Nystrom": (lambda: integrate(problem, (0, 2), method=EIPRKN12, h=0.05, t_eval=[0.301, 0.7017]).y, True),
         "eih": (lambda: integrate(bodies, method=EIPRK4).y, True),
@@ -65,11 +66,6 @@ def cases(c):
             lambda: BUILD.gradients.complex_step(lambda t, y: y @ y, 0.0, np.array([1.0, 2.0]), (), 1e-20), False,
         ),
     }  # fmt: skip
-
-
-def sampled(fun, kept):
-    """States between the steps."""
-    return integrate(fun, (0, 1), [1.0, 0.0], method=EIPRK4, h=0.1, t_eval=[0.15, 0.3], invariants=kept).y
 
 
 def stepped(fun, kept):

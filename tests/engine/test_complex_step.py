@@ -15,7 +15,6 @@ def product(t, y, *args):
 
 
 GRADIENT = 2.0 * np.array([3 * Y[0] ** 2 * Y[1], Y[0] ** 3, 0.0])
-
 KINDS = [
     product,
     lambda t, y: complex(product(t, y)),

@@ -13,7 +13,6 @@ from eip_scipy.engine.native import BUILD
 
 HERE = Path(__file__).parent
 KEPLER = HERE.parents[1] / "examples" / "c-functions" / "kepler.c"
-
 pytestmark = [
     pytest.mark.nightly,
     pytest.mark.slow,

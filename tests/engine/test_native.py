@@ -28,13 +28,8 @@ def parts(method=EIPRK4, **options):
         fun, y0 = spin, SPIN_START
     ready = prepared(RunArguments.of(fun=fun, t_span=(0, 1), y0=y0, method=method, compiled=False, **options))
     functions, _ = ready.problem.functions(ready, False)
-    return {
-        "method": ready.stepper,
-        "options": ready.options,
-        "work": ready.work,
-        "functions": functions,
-        "schedule": ready.schedule,
-    }
+    given = {name: getattr(ready, name) for name in ("options", "work", "schedule")}
+    return given | {"method": ready.stepper, "functions": functions}
 
 
 def arrays(record, path=()):

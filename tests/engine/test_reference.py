@@ -17,36 +17,22 @@ def pull(t, y):
     return np.concatenate([y[3:], -y[:3] / (y[:3] @ y[:3]) ** 1.5])
 
 
-def energy(t, y):
-    return 0.5 * y[3:] @ y[3:] - 1 / np.sqrt(y[:3] @ y[:3])
-
-
-def energy_gradient(t, y):
-    return np.concatenate([y[:3] / (y[:3] @ y[:3]) ** 1.5, y[3:]])
-
-
-def momentum(t, y):
-    return np.cross(y[:3], y[3:])
-
-
-def momentum_gradient(t, y):
-    return np.hstack([np.cross(np.eye(3), y[3:]).T, np.cross(y[:3], np.eye(3)).T])
+ENERGY = (
+    lambda t, y: 0.5 * y[3:] @ y[3:] - 1 / np.sqrt(y[:3] @ y[:3]),
+    lambda t, y: np.concatenate([y[:3] / (y[:3] @ y[:3]) ** 1.5, y[3:]]),
+)
+MOMENTUM = (
+    lambda t, y: np.cross(y[:3], y[3:]),
+    lambda t, y: np.hstack([np.cross(np.eye(3), y[3:]).T, np.cross(y[:3], np.eye(3)).T]),
+)
 
 
 def precess(t, y):
     return -1j * (np.array([1.0, 2.0, 3.5]) * y + 0.5 * np.abs(y) ** 2 * y)
 
 
-def mass(t, y):
-    return np.vdot(y, y).real
-
-
-def mass_gradient(t, y):
-    return 2 * y
-
-
-REAL = pull, [(energy, energy_gradient), (momentum, momentum_gradient)], Y0
-COMPLEX = precess, [(mass, mass_gradient)], SPINS
+REAL = pull, [ENERGY, MOMENTUM], Y0
+COMPLEX = precess, [(lambda t, y: np.vdot(y, y).real, lambda t, y: 2 * y)], SPINS
 FRAME = np.eye(6)[:1], np.eye(6)[:, :1] + 0.25 * np.eye(6)[:, 1:2]
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-
 pytest.importorskip("nanobind", reason="the stub is written by nanobind")
 
 

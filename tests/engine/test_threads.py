@@ -24,48 +24,33 @@ def in_a_list(t, y):
     return [y[2], y[3], *(-y[:2] / np.hypot(y[0], y[1]) ** 3)]
 
 
-def by_python():
-    return integrate(in_a_list, (0, 2), pericentre(0.4), method=EIPRK4, h=0.05, invariants=[H, L], compiled=False).y
-
-
-def by_scipy():
-    run = solve_ivp(orbit, (0, 2), pericentre(0.4), method=EIPRK45, invariants=[H], dense_output=True, rtol=1e-6)
-    return run.sol(np.linspace(0, 2, 20))
-
-
-def by_a_user_defined_method():
-    return integrate(oscillator, (0, 2), [1.0, 0.0], method=eip_method(Verlet()), h=0.05, invariants=SQUARE).y
-
-
-def by_the_library():
-    return integrate(kepler(), (0, 9), method=EIPDOP853, t_eval=np.linspace(0, 9, 30)).y
-
-
-def by_a_multistep_method():
-    return integrate(kepler(), (0, 9), method=EIPGJ14, h=0.02, save_every=50).y
-
-
-def as_an_ensemble():
-    starts = pericentre(0.3) + 1e-3 * np.arange(12)[:, None]
-    return ensemble(kepler(), (0, 3), starts, method=EIPRK4, h=0.05, save_every=10, executor=1).trajectories
-
-
-RUNS = [by_python, by_scipy, by_a_user_defined_method, by_the_library, by_a_multistep_method, as_an_ensemble]
+STARTS = pericentre(0.3) + 1e-3 * np.arange(12)[:, None]
+PLAIN = {"method": EIPRK4, "h": 0.05}
+SCIPY = {"method": EIPRK45, "invariants": [H], "dense_output": True, "rtol": 1e-6}
+RUNS = {
+    "by Python": lambda: integrate(in_a_list, (0, 2), pericentre(0.4), invariants=[H, L], compiled=False, **PLAIN).y,
+    "by SciPy": lambda: solve_ivp(orbit, (0, 2), pericentre(0.4), **SCIPY).sol(np.linspace(0, 2, 20)),
+    "by a user-defined method": lambda: (
+        integrate(oscillator, (0, 2), [1.0, 0.0], method=eip_method(Verlet()), h=0.05, invariants=SQUARE).y
+    ),
+    "by the library": lambda: integrate(kepler(), (0, 9), method=EIPDOP853, t_eval=np.linspace(0, 9, 30)).y,
+    "by a multistep method": lambda: integrate(kepler(), (0, 9), method=EIPGJ14, h=0.02, save_every=50).y,
+    "as an ensemble": lambda: ensemble(kepler(), (0, 3), STARTS, save_every=10, executor=1, **PLAIN).trajectories,
+}
 
 
 def test_runs_in_threads_have_the_bits_of_runs_alone():
-    expected = [run() for run in RUNS]
+    expected = {name: run() for name, run in RUNS.items()}
     together = threading.Barrier(THREADS)
 
     def all_runs(first):
         together.wait()
-        order = np.roll(np.arange(len(RUNS)), first)
-        return {int(k): RUNS[k]() for k in order}
+        return {name: RUNS[name]() for name in np.roll(list(RUNS), first).tolist()}
 
     with ThreadPoolExecutor(THREADS) as pool:
         for found in pool.map(all_runs, range(THREADS)):
-            for k, values in found.items():
-                np.testing.assert_array_equal(values, expected[k], err_msg=RUNS[k].__name__)
+            for name, values in found.items():
+                np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
 def test_a_solver_is_stepped_by_one_thread_at_a_time():

@@ -65,9 +65,6 @@ def test_resume_starts_where_there_is_nothing(tmp_path):
     same_fields(members(), members(resume=True, checkpoint=tmp_path / "kept"))
 
 
-# Another ensemble, other functions.
-
-
 def test_another_ensemble_is_refused(tmp_path):
     half_done(tmp_path / "kept")
     before = (tmp_path / "kept").read_bytes()
@@ -132,9 +129,6 @@ def test_files_that_hold_no_ensemble(tmp_path):
     place.write_text("something")
     with pytest.raises(CheckpointError, match="kept"):
         members(resume=True, checkpoint=place)
-
-
-# The time of writing, and disks that are full.
 
 
 def test_checkpoints_in_time(tmp_path):

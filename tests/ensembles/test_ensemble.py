@@ -11,13 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numba import njit
-from systems import (
-    SQUARE,
-    oscillator,
-    pericentre,
-    refuse,
-    same_fields,
-)
+from systems import SQUARE, oscillator, pericentre, refuse, same_fields
 
 from eip_scipy import EIPRK4, EIPRK5, EIPRKN12, Invariant, ProjectionWarning, ensemble, integrate
 from eip_scipy.problems import Problem, kepler
@@ -48,9 +42,6 @@ def same_members(run, single):
     assert run.names == tuple(own.diagnostics.names)
 
 
-# A member is the single run.
-
-
 def test_one_number_for_each_member_of_a_problem_with_one_parameter():
     def decay(t, y, out, params):
         out[:] = -params[0] * y
@@ -75,9 +66,6 @@ def test_the_method_of_a_problem(own):
     np.testing.assert_array_equal(given.y, ensemble(kepler(), (0, 1), y0s).y)
 
 
-# Nothing passes from member to member, nor from worker to worker.
-
-
 @pytest.mark.slow
 @needs_jit
 @pytest.mark.parametrize("more", [{}, {"save_every": 10, "reduce": lambda run: run.y.max(axis=1)}])
@@ -91,9 +79,6 @@ def test_bits_do_not_depend_on_the_number_of_threads(more):
     for run in runs[1:]:
         same_fields(runs[0], run)
     same_fields(ensemble(kepler(), SPAN, y0s, chunk=7, **more), runs[0], but=["chunk"])
-
-
-# Failures.
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=[needs_jit, pytest.mark.slow])])
@@ -163,9 +148,6 @@ def test_members_in_columns_are_told():
     assert info.value.__notes__ == ["ensemble: the rows of y0s are members; y0s has 2 rows of 5 components."]
 
 
-# Chunks: callbacks, interruption, memory.
-
-
 def test_callback_sees_chunks_in_order_and_stops():
     seen = []
 
@@ -216,9 +198,6 @@ def test_progress(capsys):
     assert "4.00/4.00" in capsys.readouterr().err
 
 
-# Bad input.
-
-
 def test_bad_input():
     masked = np.ma.array(np.ones((2, 2)), mask=np.eye(2))
     with_args = Invariant(lambda t, y, a: y @ y, lambda t, y, a: 2 * y, args=(1,))
@@ -247,14 +226,7 @@ def test_bad_input():
     refuse(ensemble, [(given | options, *rest) for options, *rest in rows])
 
 
-# Executors of concurrent.futures.
-
-
-@njit
-def jit_leaves(t, y, params):
-    return y[0] + 0.5
-
-
+jit_leaves = njit(lambda t, y, params: y[0] + 0.5)
 jit_leaves.terminal = True
 
 

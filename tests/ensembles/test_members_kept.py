@@ -19,16 +19,12 @@ STEPS = {"method": EIPRK4, "h": 0.03}
 SPAN = (0.0, 8.0)
 
 
-def crossing(t, y, params):
-    return y[1]
-
-
 def far_out(t, y, params):
     return y[0] + 1.3
 
 
 far_out.terminal = 2
-EVENTS = [crossing, far_out]
+EVENTS = [lambda t, y, params: y[1], far_out]
 
 
 def pairs(run, **options):
@@ -100,15 +96,8 @@ def test_invariants_with_parameters_for_each_member():
     """The energy has the member's own mass in it: k / 2 for the start (1, 0)."""
     stiffness = np.array([[1.0], [2.0], [5.0]])
     energy = Invariant(lambda t, y, k: 0.5 * (y[1] ** 2 + k[0] * y[0] ** 2), name="H")
-    run = ensemble(
-        lambda t, y, k: np.array([y[1], -k[0] * y[0]]),
-        (0, 1),
-        [1.0, 0.0],
-        params=stiffness,
-        invariants=energy,
-        method=EIPRK4,
-        h=0.1,
-    )
+    options = {"params": stiffness, "invariants": energy, "method": EIPRK4, "h": 0.1}
+    run = ensemble(lambda t, y, k: np.array([y[1], -k[0] * y[0]]), (0, 1), [1.0, 0.0], **options)
     np.testing.assert_allclose(run.invariants, stiffness / 2, rtol=1e-11)
     np.testing.assert_array_equal(run.target, stiffness / 2)
 
@@ -171,8 +160,6 @@ def test_a_wrong_reduce():
         assert info.value.partial.status.shape == (len(STARTS),)
 
 
-# Executors, files.
-
 CASES = {
     "last states": {},
     "rows": {"save_every": 50},
@@ -208,16 +195,9 @@ def test_saved_and_loaded_and_run_elsewhere(case, tmp_path):
         np.testing.assert_array_equal(file["y"], run.y)
 
 
-# Figures.
-
-
-def drawn(run, **options):
-    return [axis for axis in run.plot(**options).axes if axis.get_visible()]
-
-
 def test_a_figure_of_members_in_time(tmp_path):
     run = ensemble(PROBLEM, SPAN, STARTS, save_every=20, **STEPS)
-    *fans, errors, counts = drawn(run)
+    *fans, errors, counts = (axis for axis in run.plot().axes if axis.get_visible())
     assert [axis.get_ylabel() for axis in fans] == ["x", "y", "vx", "vy"]
     assert fans[0].get_legend().get_title().get_text() == "of members still running: at least 20 of 21"
     median = np.nanmedian(run.trajectories[:, 0], axis=0)

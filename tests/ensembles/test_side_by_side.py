@@ -5,19 +5,9 @@ import math
 import numpy as np
 import pytest
 from numba import njit
+from systems import jit_oscillator
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPGJ14,
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN8,
-    EIPRKN12,
-    ensemble,
-    integrate,
-)  # fmt: skip
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK4, EIPRK5, EIPRK45, EIPRKN8, EIPRKN12, ensemble, integrate
 from eip_scipy.ensembles import members as running
 from eip_scipy.problems import harmonic, kepler, solar_system
 from eip_scipy.problems.gravity.nbody import nbody
@@ -111,17 +101,12 @@ def with_a_branch(t, y, out):
     out[1] = -y[0] if y[0] > 0 else -4 * y[0]
 
 
-@njit
-def with_an_array(t, y):
-    return np.array([y[1], -y[0]])
-
-
 JITTED = [pytest.mark.slow, pytest.mark.needs_jit]
 TWO = np.array([1.0, 0.5])
 PLAIN = {"method": EIPRK4, "h": 0.05, "invariants": ()}
 ONE_BY_ONE = [
     pytest.param(with_a_branch, TWO, 4, PLAIN | {"in_place": True}, "fun does not compile", marks=JITTED),
-    pytest.param(with_an_array, TWO, 4, PLAIN | {"in_place": False}, "fun does not compile", marks=JITTED),
+    pytest.param(jit_oscillator, TWO, 4, PLAIN | {"in_place": False}, "fun does not compile", marks=JITTED),
     (harmonic(), harmonic().y0, 1, {"method": EIPRK45, "first_step": 0.1}, "steps are adaptive"),
     (kepler(), kepler().y0, 0.2, {"method": EIPGJ14, "h": 0.02},
      "the run has fewer steps than the history of the method"),

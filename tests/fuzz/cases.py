@@ -1,7 +1,5 @@
 """Random systems with random options, one for each number: arguments of a run, and known properties of its result."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -65,21 +63,19 @@ class Case:
     growth: float
 
     @property
-    def regular(self) -> bool:
+    def regular(self):
         """Return whether neighbouring motions stay neighbours, so that a run can be compared with the true one."""
         return self.growth < REGULAR
 
     @property
-    def native(self) -> bool:
-        """Return whether all functions are Numba functions."""
+    def native(self):
         return self.system.name == jitted.NAME
 
-    def error(self, y: Array) -> float:
+    def error(self, y):
         """Return the largest error of the states (n, SAMPLES), in units of the components' sizes."""
         return float(np.max(np.abs(y - self.truth) / self.size[:, None]))
 
-    def solve_ivp(self, **options: Any) -> Any:
-        """Return the run by SciPy."""
+    def solve_ivp(self, **options):
         fun = counted(self.system.fun)
         given = {"invariants": self.invariants, **self.steps, **self.projection}
         if self.params is not None and not self.native:
@@ -89,7 +85,7 @@ class Case:
         return solve_ivp(fun, self.t_span, self.system.y0.copy(), method=method(self.method), **given | options)
 
     @property
-    def fun(self) -> Callable[..., Any]:
+    def fun(self):
         """Return the right-hand side, or the acceleration, as `integrate` and `ensemble` take it."""
         if self.native:
             return jitted.acceleration if self.method in NYSTROM else jitted.motion
@@ -101,13 +97,11 @@ class Case:
         return filling(fun) if self.in_place else fun
 
     @property
-    def takes(self) -> str:
-        """Return the name of the argument for `fun`."""
+    def takes(self):
         return "acceleration" if self.method in NYSTROM else "fun"
 
     @property
-    def options(self) -> dict[str, Any]:
-        """Return the options of both."""
+    def options(self):
         given = {
             "method": method(self.method),
             "invariants": self.invariants,
@@ -123,17 +117,16 @@ class Case:
             given["events"] = self.events
         return given
 
-    def integrate(self, **options: Any) -> Any:
-        """Return the run by `integrate`."""
+    def integrate(self, **options):
         given = {self.takes: options.pop("fun", None) or self.fun, "t_span": self.t_span}
         return eip_scipy.integrate(**given, y0=self.system.y0.copy(), **self.options | options)
 
-    def __str__(self) -> str:
+    def __str__(self):
         kept = ", ".join(str(item.name) for item in self.invariants) or "nothing"
         shown = [f"{name}={value!r}" for name, value in (self.steps | self.projection).items()]
         shown += [name for name in ("compensated", "in_place", "sick") if getattr(self, name)]
         shown += ["params"] if self.params is not None else []
-        shown += [f"event(terminal={e.terminal}, direction={e.direction})" for e in self.events]  # type: ignore[attr-defined]
+        shown += [f"event(terminal={e.terminal}, direction={e.direction})" for e in self.events]
         notes = "".join(f", {note}" for note in self.system.notes)
         return (
             f"{self.system.name}, {self.system.y0.size} components{notes}; kept: {kept}; {self.method} on "
@@ -141,16 +134,15 @@ class Case:
         )
 
 
-def method(name: str) -> Any:
-    """Return the class of that name."""
+def method(name):
     return getattr(eip_scipy, name)
 
 
-def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
+def counted(fun):
     """Return the function with a bound on the number of calls."""
     calls = 0
 
-    def bounded(*args: Any) -> Any:
+    def bounded(*args):
         nonlocal calls
         calls += 1
         if calls > MOST_CALLS:
@@ -160,22 +152,19 @@ def counted(fun: Callable[..., Any]) -> Callable[..., Any]:
     return bounded
 
 
-def with_params(fun: Callable[..., Any]) -> Callable[..., Any]:
+def with_params(fun):
     """Return the function with one more argument, whose first number is 1."""
     return lambda t, y, p: fun(t, y) * p[0]
 
 
-def filling(fun: Callable[..., Any]) -> Callable[..., None]:
-    """Return the function in place."""
-
-    def fill(t: float, y: Array, out: Array, *params: Array) -> None:
+def filling(fun):
+    def fill(t, y, out, *params):
         out[:] = fun(t, y, *params)
 
     return fill
 
 
-def random_case(seed: int) -> Case:
-    """Return the case of that number."""
+def random_case(seed):
     rng = np.random.default_rng(seed)
     params, in_place, sick = None, False, False
     if rng.random() < 0.15:
@@ -212,10 +201,7 @@ def random_case(seed: int) -> Case:
     return Case(seed=seed, system=system, method=name, t_span=t_span, **given, **options, **known)
 
 
-# Preserved quantities.
-
-
-def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
+def _chosen(rng, system):
     """Return some preserved quantities, in any order, perhaps with a dependent one, or two of them as one vector."""
     kept = system.kept
     if rng.random() < 0.05:
@@ -230,59 +216,59 @@ def _chosen(rng: np.random.Generator, system: System) -> tuple[Quantity, ...]:
     return tuple(chosen)
 
 
-def _vanishes(a: Quantity, system: System) -> bool:
+def _vanishes(a, system):
     """Return whether a part of it is rounding at the start: the square of that has no gradient to project along."""
     t, y = system.t0, system.y0
     return bool(np.any(np.abs(a.fun(t, y)) <= 1e-8 * (np.abs(a.grad(t, y)) @ np.abs(y))))
 
 
-def _multiple(rng: np.random.Generator, a: Quantity) -> Quantity:
+def _multiple(rng, a):
     factor = float(rng.choice([1.0, -2.5, 1e4]))
     return Quantity(f"{factor:g} {a.name}", lambda t, y: factor * a.fun(t, y), lambda t, y: factor * a.grad(t, y))
 
 
-def _square(rng: np.random.Generator, a: Quantity) -> Quantity:
-    def gradient(t: float, y: Array) -> Array:
+def _square(rng, a):
+    def gradient(t, y):
         return 2 * np.asarray(a.fun(t, y))[..., None] * a.grad(t, y)
 
     return Quantity(f"{a.name}^2", lambda t, y: a.fun(t, y) ** 2, gradient)
 
 
-def _stacked(a: Quantity, b: Quantity) -> Quantity:
-    def value(t: float, y: Array) -> Array:
+def _stacked(a, b):
+    def value(t, y):
         return np.concatenate([np.atleast_1d(a.fun(t, y)), np.atleast_1d(b.fun(t, y))])
 
     return Quantity(f"({a.name}, {b.name})", value, lambda t, y: np.vstack([a.grad(t, y), b.grad(t, y)]))
 
 
-def _leaking(rng: np.random.Generator, system: System, a: Quantity) -> Quantity:
+def _leaking(rng, system, a):
     """Return a quantity that is nearly kept, with a further term whose rate may vanish at the start."""
     y0, unit, power = system.y0, system.unit, int(rng.integers(1, 3))
     amount = 10 ** rng.uniform(-4, 0) * np.max(np.abs(a.fun(system.t0, y0)))
     way = rng.standard_normal(y0.size)
 
-    def moved(y: Array) -> float:
+    def moved(y):
         return float(np.real(way @ ((y - y0) * unit)))
 
-    def gradient(t: float, y: Array) -> Array:
+    def gradient(t, y):
         return a.grad(t, y) + amount * power * moved(y) ** (power - 1) * way * unit
 
     return Quantity(f"leaking {a.name}", lambda t, y: a.fun(t, y) + amount * moved(y) ** power, gradient)
 
 
-def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array | None) -> Invariant:
+def _formed(rng, a, system, params):
     """Return an `Invariant`, with or without a gradient, in place or not, by f or not."""
 
-    def factor(args: tuple[Any, ...]) -> float:
+    def factor(args):
         return args[0][1] if args else 1.0
 
-    def fun(t: float, y: Array, *args: Any) -> Any:
+    def fun(t, y, *args):
         return a.fun(t, y) * factor(args)
 
     by_f = a.by_f if rng.random() < 0.4 else None
     in_place = bool(rng.random() < 0.3)
 
-    def value(*arguments: Any) -> Array:
+    def value(*arguments):
         """Return the gradient for (t, y, [f], *args)."""
         if by_f is None:
             t, y, *args = arguments
@@ -290,11 +276,11 @@ def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array
         t, y, f, *args = arguments
         return by_f(t, y, f) * factor(tuple(args))
 
-    def fill(*arguments: Any) -> None:
+    def fill(*arguments):
         at = 2 if by_f is None else 3
         arguments[at][...] = value(*arguments[:at], *arguments[at + 1 :])
 
-    options: dict[str, Any] = {"name": a.name, "args": () if params is None else (params,)}
+    options = {"name": a.name, "args": () if params is None else (params,)}
     start = fun(system.t0, system.y0, *options["args"])
     if rng.random() < 0.08:
         options["target"] = start
@@ -305,17 +291,12 @@ def _formed(rng: np.random.Generator, a: Quantity, system: System, params: Array
     return Invariant(fun, fill if in_place else value, in_place=in_place, uses_f=by_f is not None, **options)
 
 
-# How it is run.
-
-
-def _steps(
-    rng: np.random.Generator, system: System, h: float, length: float, least_rtol: float | None, size: Array
-) -> dict[str, Any]:
+def _steps(rng, system, h, length, least_rtol, size):
     if least_rtol is None or rng.random() < 0.5:
         # The default atol is for states of about 1.
         return {"h": float(h)} | ({} if np.ndim(system.unit) == 0 else {"atol": 1e-6 * size})
     rtol = float(10 ** rng.uniform(math.log10(least_rtol), -3))
-    steps: dict[str, Any] = {"rtol": rtol, "atol": rtol * float(rng.choice([1e-3, 1.0])) * size}
+    steps = {"rtol": rtol, "atol": rtol * float(rng.choice([1e-3, 1.0])) * size}
     if rng.random() < 0.2:
         steps["first_step"] = float(h * rng.uniform(0.01, 1.0))
     if rng.random() < 0.2:
@@ -323,10 +304,10 @@ def _steps(
     return steps
 
 
-def _projection(rng: np.random.Generator, system: System, size: Array, has_estimate: bool) -> dict[str, Any]:
+def _projection(rng, system, size, has_estimate):
     n = size.size
     one_unit = np.ndim(system.unit) == 0
-    found: dict[str, Any] = {}
+    found = {}
     weights = rng.uniform(0.2, 1.0, n) / system.unit
     if rng.random() < 0.4:
         # The euclidean metric, also the one in the place of a missing estimate, is for components of one unit.
@@ -342,37 +323,34 @@ def _projection(rng: np.random.Generator, system: System, size: Array, has_estim
     if rng.random() < 0.3:
         found["direction"] = str(rng.choice(["old", "midpoint"]))
     every = [2, 3, 10, "auto" if has_estimate else 5]
-    others: dict[str, Any] = {"iterations": int(rng.integers(2, 4)), "every": every[rng.integers(4)]}
+    others = {"iterations": int(rng.integers(2, 4)), "every": every[rng.integers(4)]}
     others |= {"reuse_f": False, "project_initial": True, "check": False}
     shares = {"iterations": 0.2, "every": 0.4, "reuse_f": 0.2, "project_initial": 0.05, "check": 0.05}
     found |= {name: others[name] for name, share in shares.items() if rng.random() < share}
     return found
 
 
-def _events(rng: np.random.Generator, size: Array) -> tuple[Callable[..., float], ...]:
+def _events(rng, size):
     if rng.random() < 0.7:
         return ()
     return tuple(_event(rng, int(rng.integers(size.size)), size) for _ in range(rng.integers(1, 3)))
 
 
-def _event(rng: np.random.Generator, k: int, size: Array) -> Callable[..., float]:
+def _event(rng, k, size):
     level = rng.uniform(-0.5, 0.5) * size[k]
 
-    def event(t: float, y: Array, *args: Any) -> float:
+    def event(t, y, *args):
         return float(y[k].real - level)
 
-    event.terminal = [False, False, True, 2][rng.integers(4)]  # type: ignore[attr-defined]
-    event.direction = float(rng.integers(-1, 2))  # type: ignore[attr-defined]
+    event.terminal = [False, False, True, 2][rng.integers(4)]
+    event.direction = float(rng.integers(-1, 2))
     return event
 
 
-# Known properties of the motion.
-
-
-def _rate(system: System, sign: float) -> float:
+def _rate(system, sign):
     """Return the fastest rate along the motion: that of the linearised equations, or of the state as a whole."""
 
-    def at(t: float, y: Array) -> float:
+    def at(t, y):
         x, unit = _floats(y), np.repeat(np.broadcast_to(system.unit, y.size), 2 if y.dtype.kind == "c" else 1)
         step = 1e-6 * np.max(np.abs(x * unit)) / unit
         columns = []
@@ -392,11 +370,11 @@ def _rate(system: System, sign: float) -> float:
     return max(at(t, y) for t, y in zip(sol.t, sol.y.T.copy(), strict=True))
 
 
-def _floats(y: Array) -> Array:
+def _floats(y):
     return np.ascontiguousarray(y).view(float)
 
 
-def _truth(rng: np.random.Generator, system: System, times: Array) -> tuple[Array, float]:
+def _truth(rng, system, times):
     """Return the states (n, SAMPLES) at `times`, and the separation of neighbours."""
     if system.exact is not None:
         return np.column_stack([system.exact(t) for t in times]), 1.0
@@ -408,7 +386,7 @@ def _truth(rng: np.random.Generator, system: System, times: Array) -> tuple[Arra
     return truth, max(1.0, float(np.max(np.abs(other - truth) / size[:, None])) / NEARBY)
 
 
-def _states(system: System, y0: Array, times: Array, rtol: float, atol: Array) -> Array:
+def _states(system, y0, times, rtol, atol):
     """Return states by SciPy's DOP853, from one of the times to the next."""
     found, t, y = [], system.t0, y0
     for end in times:

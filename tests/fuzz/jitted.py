@@ -4,8 +4,6 @@ Particles in the plane in an anharmonic trap, each tied to the next one by a spr
 The state is (x1, y1, x2, y2, ..., their velocities), params are (k, b, c) of the trap and springs.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 
@@ -64,15 +62,12 @@ def energy_gradient_by_f(t, y, f, out, p):
 
 
 NAME = "jitted"
-KEPT = {
-    "energy": (energy, energy_gradient, False),
-    "energy by f": (energy, energy_gradient_by_f, True),
-}
+KEPT = {"energy": (energy, energy_gradient, False), "energy by f": (energy, energy_gradient_by_f, True)}
 # Few, since Numba compiles each choice by itself.
 CHOICES = ((), ("energy",), ("energy by f",), ("energy", "energy by f"))
 
 
-def jitted_system(rng: np.random.Generator) -> tuple[System, tuple[Invariant, ...], np.ndarray]:
+def jitted_system(rng):
     """A system of the family, what is to be kept of it, and its params."""
     n = int(rng.integers(1, 5))
     p = np.array([rng.uniform(0.3, 2.0), rng.uniform(0.0, 0.5), rng.uniform(0.0, 0.5)])

@@ -28,7 +28,6 @@ SIGNALS = {signal.SIGKILL: (0, -9), signal.SIGINT: (0, 1), signal.SIGTERM: (0, 1
 LONGEST = 0.9  # seconds from the start of a run to its kill; a whole run takes about as long
 MOST = 4  # kills of one run before it may end
 PATIENCE = 30.0
-
 ORBIT = families.kepler(np.random.default_rng(5))
 KEPT = [Invariant(k.fun, k.grad, name=k.name) for k in ORBIT.kept]
 STARTS = ORBIT.y0 * np.linspace(0.95, 1.05, 30)[:, None]
@@ -126,7 +125,6 @@ def chain(seed, path, context, most, killed):
 
 
 def main(arguments=None):
-    """Run the script; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.kills", description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=60, help="stop after this number")
     parser.add_argument("--seed", type=int, default=0, help="the number of the first chain of kills")

@@ -6,8 +6,6 @@ Each system is made from a number. A violation prints the number, the system and
 it again; the exit status is then 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math
@@ -17,10 +15,8 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numba
@@ -28,7 +24,7 @@ import numpy as np
 
 from eip_scipy import Diagnostics, ProjectionWarning, ensemble
 
-from .cases import Case, TooManyCallsError, random_case
+from .cases import TooManyCallsError, random_case
 
 # Largest error of a reliable run relative to the run without projection.
 FACTOR = 1e3
@@ -47,45 +43,36 @@ class BrokenOffError(Exception):
 class Runs:
     """The runs of a case, each made on first use, with its warnings."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case):
         self.case = case
         self.rng = np.random.default_rng([case.seed, 1])
 
     @cached_property
-    def _whole(self) -> tuple[Any, list[warnings.WarningMessage]]:
+    def whole(self):
+        """Return the run by `integrate`, every step saved."""
         return observed(lambda: self.case.integrate(save_every=1))
 
-    @property
-    def whole(self) -> Any:
-        """Return the run by `integrate`, every step saved."""
-        return self._whole[0]
-
-    @property
-    def warned(self) -> list[warnings.WarningMessage]:
-        """Return the warnings of the run."""
-        return self._whole[1]
-
     @cached_property
-    def plain(self) -> Any:
+    def plain(self):
         """Return the run without invariants, at the times of the truth."""
         options = {"invariants": (), "t_eval": self.case.times, "events": None, "project_initial": False}
-        return observed(lambda: self.case.integrate(**options))[0]
+        return observed(lambda: self.case.integrate(**options))
 
     @cached_property
-    def sampled(self) -> Any:
+    def sampled(self):
         """Return the run with invariants, at the same times."""
-        return observed(lambda: self.case.integrate(t_eval=self.case.times, events=None))[0]
+        return observed(lambda: self.case.integrate(t_eval=self.case.times, events=None))
 
     @cached_property
-    def scipy(self) -> Any:
+    def scipy(self):
         """Return the run by SciPy's `solve_ivp`, with its diagnostics and warnings."""
         record = Diagnostics()
-        found, warned = observed(lambda: self.case.solve_ivp(diagnostics=record, dense_output=True))
-        found.diagnostics, found.warned = record, warned
+        found = observed(lambda: self.case.solve_ivp(diagnostics=record, dense_output=True))
+        found.diagnostics = record
         return found
 
     @cached_property
-    def allowed(self) -> float:
+    def allowed(self):
         """Return the allowed error of a reliable run; infinite if there is no reference."""
         case = self.case
         if not case.regular or self.plain.status != 0:
@@ -94,29 +81,30 @@ class Runs:
         return FACTOR * case.error(self.plain.y) + tolerance + FLOOR * case.growth
 
     @property
-    def checked(self) -> bool:
-        """Return whether the run checks its invariants."""
+    def checked(self):
         return bool(self.case.projection.get("check", True))
 
     @property
-    def healthy(self) -> bool:
+    def healthy(self):
         """Return whether the system is correct, and the steps resolve it."""
         return not self.case.sick and self.allowed < FACTOR * 1e-2
 
 
-def observed(call: Callable[[], Any]) -> tuple[Any, list[warnings.WarningMessage]]:
-    """Return the result of a call, and its warnings."""
+def observed(call):
+    """Return the result of a call, with its warnings as `warned`."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        return call(), warned
+        found = call()
+    found.warned = warned
+    return found
 
 
-def same(one: Any, other: Any) -> bool:
+def same(one, other):
     """Compare bit for bit, except the sign of zero and the kinds of NaN."""
     return np.array_equal(one, other, equal_nan=True)
 
 
-def different(one: Any, other: Any, *names: str) -> Iterator[str]:
+def different(one, other, *names):
     """Return the names of the numbers of two results that differ in bits."""
     for name in names:
         a, b = getattr(one, name), getattr(other, name)
@@ -124,18 +112,18 @@ def different(one: Any, other: Any, *names: str) -> Iterator[str]:
             yield f"{name}: {_short(a)} and {_short(b)}"
 
 
-def projected_rows(case: Case, steps: int) -> list[int]:
+def projected_rows(case, steps):
     """Return which of the states at the ends of steps are known to be projected."""
     every = case.projection.get("every", 1)
     return list(range(0, steps, every)) if isinstance(every, int) else [0]
 
 
-def _short(value: Any) -> str:
+def _short(value):
     a = np.asarray(value)
     return f"{value!r}" if a.size <= 8 else f"{a.dtype} {a.shape} ending with {a[..., -1]!r}"
 
 
-def different_events(run: Any, other: Any) -> Iterator[str]:
+def different_events(run, other):
     """Events of `solve_ivp` that `integrate` has not found too, up to the rounding of the roots."""
     span = np.ptp(run.t)
     for k, (found, expected) in enumerate(zip(run.t_events or (), other.t_events or (), strict=True)):
@@ -148,7 +136,7 @@ def different_events(run: Any, other: Any) -> Iterator[str]:
 # Conditions on runs. Each check yields the violations.
 
 
-def finite(runs: Runs) -> Iterator[str]:
+def finite(runs):
     """Check that success means finite numbers, times in order, and the requested end."""
     for name, run in (("saved", runs.whole), ("sampled", runs.sampled), ("solve_ivp", runs.scipy)):
         if not run.success:
@@ -163,7 +151,7 @@ def finite(runs: Runs) -> Iterator[str]:
             yield f"{name}: status 0 at t = {run.t[-1]!r}, not at {end!r}"
 
 
-def accurate(runs: Runs) -> Iterator[str]:
+def accurate(runs):
     """Check that a reliable run errs at most `FACTOR` times as much as the one without projection."""
     run = runs.sampled
     if run.trusted and (runs.checked or not runs.case.sick) and math.isfinite(runs.allowed):
@@ -175,7 +163,7 @@ def accurate(runs: Runs) -> Iterator[str]:
             )
 
 
-def survives(runs: Runs) -> Iterator[str]:
+def survives(runs):
     """Check that steps which resolve the motion neither fail nor become far more numerous with projection.
 
     Other directions and further iterations have no second tries where gradients are nearly parallel; they may fail.
@@ -189,7 +177,7 @@ def survives(runs: Runs) -> Iterator[str]:
         yield f"{runs.sampled.nfev} evaluations, {runs.plain.nfev} without projection"
 
 
-def kept(runs: Runs) -> Iterator[str]:
+def kept(runs):
     """Check that the invariants of saved states agree with `max_residual`."""
     run, case = runs.whole, runs.case
     if not run.success or not run.max_residual.size or case.compensated:
@@ -201,18 +189,18 @@ def kept(runs: Runs) -> Iterator[str]:
         yield f"saved states are off by {off}, max_residual says {run.max_residual}"
 
 
-def quiet(runs: Runs) -> Iterator[str]:
+def quiet(runs):
     """Check that there are no warnings, except those of numerical gradients and of doubts in the run."""
     if runs.healthy:
-        for warned in (*runs.warned, *runs.scipy.warned):
+        for warned in (*runs.whole.warned, *runs.scipy.warned):
             if DIFFERENCES not in str(warned.message) and not issubclass(warned.category, ProjectionWarning):
                 yield f"{warned.category.__name__}: {warned.message}"
 
 
-def told(runs: Runs) -> Iterator[str]:
+def told(runs):
     """Check that `trusted`, the warning, the message and the diagnostics agree."""
-    for name, run, warned in (("integrate", runs.whole, runs.warned), ("solve_ivp", runs.scipy, runs.scipy.warned)):
-        record = run.diagnostics
+    for name, run in (("integrate", runs.whole), ("solve_ivp", runs.scipy)):
+        record, warned = run.diagnostics, run.warned
         doubts = [str(w.message) for w in warned if issubclass(w.category, ProjectionWarning)]
         early = [w for w in warned if NO_INVARIANT in str(w.message)]
         # A solver does not see that an event has ended its run: what all corrections say together stands in the
@@ -233,7 +221,7 @@ def told(runs: Runs) -> Iterator[str]:
             yield f"{name}: warned of {doubts[0]!r}, and Diagnostics.message is empty"
 
 
-def through_scipy(runs: Runs) -> Iterator[str]:
+def through_scipy(runs):
     """Check that `solve_ivp` takes the steps of `integrate`, with the same bits; SciPy's own if nothing is kept."""
     case, run, other = runs.case, runs.whole, runs.scipy
     if case.compensated:
@@ -257,7 +245,7 @@ def through_scipy(runs: Runs) -> Iterator[str]:
         yield from different_events(run, other)
 
 
-def dense(runs: Runs) -> Iterator[str]:
+def dense(runs):
     """Check that dense output meets the states at the ends of steps, and that `t_eval` is dense output."""
     run, case = runs.scipy, runs.case
     if run.t.size < 2:  # no step was taken: nothing in between
@@ -276,7 +264,7 @@ def dense(runs: Runs) -> Iterator[str]:
             yield f"sol and t_eval differ by {np.abs(found - runs.sampled.y).max()}"
 
 
-def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
+def resumed(runs, *, compiled=False):
     """Check that a run that is stopped repeatedly and resumed equals the whole one."""
     whole, case = runs.whole, runs.case
     broken, kinds = 0, [_at_a_row] if compiled else [_at_a_row, _at_a_call]
@@ -288,7 +276,7 @@ def resumed(runs: Runs, *, compiled: bool = False) -> Iterator[str]:
                 observed(lambda more=breaking: case.integrate(**options, **more))
             except BrokenOffError:
                 broken += 1
-        run, _ = observed(lambda: case.integrate(**options))
+        run = observed(lambda: case.integrate(**options))
     found = [*different(whole, run, *BITS), *different_events(whole, run)]
     found += different(whole.diagnostics, run.diagnostics, *COUNTS)
     if run.message.split(" (")[0] != whole.message.split(" (")[0]:
@@ -301,17 +289,17 @@ BITS = ("t", "y", "invariants", "max_residual", "status", "nfev", "njev", "nlu",
 COUNTS = ("n_projections", "n_skipped", "n_rank_reduced", "n_rejected_projections", "max_correction")
 
 
-def _hasty_clock() -> Callable[[], float]:
+def _hasty_clock():
     """Clock that advances by a large step each time it is read: checkpoints are due between any two steps."""
     read = itertools.count()
     return lambda: CLOCK_STEP * next(read)
 
 
-def _at_a_row(runs: Runs) -> dict[str, Any]:
+def _at_a_row(runs):
     """Return options that stop the run at a saved state."""
     left = int(runs.rng.integers(runs.whole.t.size + 1))
 
-    def stop(t: float, y: np.ndarray, residuals: np.ndarray) -> None:
+    def stop(t, y, residuals):
         nonlocal left
         left -= 1
         if left < 0:
@@ -320,11 +308,11 @@ def _at_a_row(runs: Runs) -> dict[str, Any]:
     return {"callback": stop}
 
 
-def _at_a_call(runs: Runs) -> dict[str, Any]:
+def _at_a_call(runs):
     """Return options that stop the run inside a step."""
     left, fun = int(runs.rng.integers(1, runs.whole.nfev + 5)), runs.case.fun
 
-    def failing(*arguments: Any) -> Any:
+    def failing(*arguments):
         nonlocal left
         left -= 1
         if left < 0:
@@ -334,16 +322,16 @@ def _at_a_call(runs: Runs) -> dict[str, Any]:
     return {"fun": failing}
 
 
-def members(runs: Runs, **options: Any) -> Iterator[str]:
+def members(runs, **options):
     """Check that a member of an ensemble equals the single run."""
     case = runs.case
-    if any(not event.terminal for event in case.events):  # type: ignore[attr-defined]
+    if any(not event.terminal for event in case.events):
         return
     starts = np.tile(case.system.y0, (2, 1))
     if all(item.target is None for item in case.invariants):
         starts[0] += 1e-3 * case.size * runs.rng.standard_normal(case.size.size)
     given = {**case.options, "t_eval": case.times, **options}
-    run, _ = observed(lambda: ensemble(**{case.takes: case.fun}, t_span=case.t_span, y0s=starts, **given))
+    run = observed(lambda: ensemble(**{case.takes: case.fun}, t_span=case.t_span, y0s=starts, **given))
     if any(TooManyCallsError.__name__ in message for message in run.message):  # calls are counted for both together
         return
     alone = runs.whole
@@ -361,16 +349,17 @@ def members(runs: Runs, **options: Any) -> Iterator[str]:
         yield "other trajectories"
 
 
-def native(runs: Runs) -> Iterator[str]:
+def native(runs):
     """Check that compiled runs have the bits of interpreted ones, also stopped or as members."""
     case, whole = runs.case, runs.whole
     if not case.native or numba.config.DISABLE_JIT:
         return
-    run, warned = observed(lambda: case.integrate(save_every=1, compiled=True))
+    run = observed(lambda: case.integrate(save_every=1, compiled=True))
     yield from different(whole, run, *BITS)
     yield from different(whole.diagnostics, run.diagnostics, *COUNTS)
-    if [str(w.message) for w in warned] != [str(w.message) for w in runs.warned]:
-        yield f"warned of {[str(w.message) for w in warned]}, interpreted of {[str(w.message) for w in runs.warned]}"
+    one, other = ([str(w.message) for w in made.warned] for made in (run, whole))
+    if one != other:
+        yield f"warned of {one}, interpreted of {other}"
     yield from resumed(runs, compiled=True)
     yield from members(runs, compiled=True)
 
@@ -378,7 +367,7 @@ def native(runs: Runs) -> Iterator[str]:
 CHECKS = (finite, accurate, survives, kept, quiet, told, through_scipy, dense, resumed, members, native)
 
 
-def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
+def look_at(seed):
     """Run the case of that number; what was violated, and how. None: it takes too long, with and without projection."""
     case = random_case(seed)
     runs, wrong = Runs(case), []
@@ -397,8 +386,7 @@ def look_at(seed: int) -> tuple[Runs | None, list[tuple[str, str]]]:
     return runs, wrong
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the script; return its exit status."""
+def main(arguments=None):
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.systems", description=__doc__.partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after this number of seconds")
     parser.add_argument("--count", type=int, default=None, help="stop after this number of systems")
@@ -406,7 +394,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     if given.count is None and math.isinf(given.seconds):
         given.seconds = 60.0
-    count, begin, doubted, last = Counter[str](), time.monotonic(), [], given.seed
+    count, begin, doubted, last = Counter(), time.monotonic(), [], given.seed
     for seed in itertools.count(given.seed):
         if time.monotonic() - begin > given.seconds or seed - given.seed == given.count:
             break

@@ -8,9 +8,7 @@ pytestmark = pytest.mark.needs_jit  # interpreted kernels would take minutes
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [12, 16, *(pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in (0, 4, 8))]
-)
+@pytest.mark.parametrize("seed", [12, 16, *(pytest.param(k, marks=pytest.mark.nightly) for k in (0, 4, 8))])
 def test_random_systems(seed, capsys):
     assert systems.main(["--seed", str(seed), "--count", "4"]) == 0, capsys.readouterr().out
 

@@ -16,13 +16,8 @@ from eip_scipy.integrations.astropy import julian_date, nbody, plain, positions,
 
 AU, YR, DAY, KM_S = units.AU, units.yr, units.day, units.km / units.s
 EPOCH = Time(2456690.5, 20.3 / 24, format="jd", scale="tdb")
-SUN_AND_JUPITER = {
-    "gm": [1, 1e-3] * units.Msun,
-    "position": [[0, 0, 0], [5, 0, 0]] * AU,
-    "velocity": [[0, 0, 0], [0, 13, 0]] * KM_S,
-    "t_span": (0, 12) * YR,
-    "units": "AU, yr",
-}
+SUN_AND_JUPITER = {"gm": [1, 1e-3] * units.Msun, "t_span": (0, 12) * YR, "units": "AU, yr"}
+SUN_AND_JUPITER |= {"position": [[0, 0, 0], [5, 0, 0]] * AU, "velocity": [[0, 0, 0], [0, 13, 0]] * KM_S}
 ORBIT = Problem("own", lambda t, y: -y, np.ones(2), (0, 1), units="m, s")
 
 

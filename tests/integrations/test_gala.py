@@ -6,34 +6,24 @@ import pytest
 gala = pytest.importorskip("gala", reason='needs gala: pip install "eip_scipy[gala]"')
 
 from astropy import units as u  # noqa: E402
+from gala import potential as gp  # noqa: E402
 from gala.dynamics import PhaseSpacePosition  # noqa: E402
 from gala.integrate import DOPRI853Integrator  # noqa: E402
-from gala.potential import (  # noqa: E402
-    CCompositePotential,
-    ConstantRotatingFrame,
-    Hamiltonian,
-    LongMuraliBarPotential,
-    MiyamotoNagaiPotential,
-    NFWPotential,
-    PotentialBase,
-)
 from gala.potential.common import PotentialParameter  # noqa: E402
 from gala.units import dimensionless, galactic  # noqa: E402
 
 from eip_scipy.integrations.gala import integrate_orbit  # noqa: E402
 
 W = np.array([8.0, 0.0, 0.5, 0.03, 0.2, 0.05])
-HALO = CCompositePotential(
-    disk=MiyamotoNagaiPotential(m=6e10, a=3, b=0.3, units=galactic), halo=NFWPotential(m=6e11, r_s=15, units=galactic)
-)
-BAR = CCompositePotential(
-    disk=HALO["disk"], bar=LongMuraliBarPotential(m=1e10, a=4, b=0.5, c=0.3, alpha=0.3, units=galactic)
-)
+DISK = gp.MiyamotoNagaiPotential(m=6e10, a=3, b=0.3, units=galactic)
+HALO = gp.CCompositePotential(disk=DISK, halo=gp.NFWPotential(m=6e11, r_s=15, units=galactic))
+BAR = gp.LongMuraliBarPotential(m=1e10, a=4, b=0.5, c=0.3, alpha=0.3, units=galactic)
+BAR = gp.CCompositePotential(disk=DISK, bar=BAR)
 SPEED = [0, 0, -40] * u.km / u.s / u.kpc
 TIMES = {"dt": 5.0, "n_steps": 400}
 
 
-class Ring(PotentialBase):
+class Ring(gp.PotentialBase):
     """A harmonic potential in Python, in two dimensions."""
 
     k = PotentialParameter("k", physical_type=None)
@@ -50,13 +40,13 @@ class Ring(PotentialBase):
     ("hamiltonian", "turns"),
     [
         (HALO, True),
-        (Hamiltonian(HALO, ConstantRotatingFrame([10, 0, 40] * u.km / u.s / u.kpc, units=galactic)), False),
-        (Hamiltonian(BAR, ConstantRotatingFrame(SPEED, units=galactic)), False),
+        (gp.Hamiltonian(HALO, gp.ConstantRotatingFrame([10, 0, 40] * u.km / u.s / u.kpc, units=galactic)), False),
+        (gp.Hamiltonian(BAR, gp.ConstantRotatingFrame(SPEED, units=galactic)), False),
     ],
 )
 def test_orbits(hamiltonian, turns):
     """In each frame: gala's orbit at tight tolerances, its energy, and the angular momentum where it is kept."""
-    h = Hamiltonian(hamiltonian)
+    h = gp.Hamiltonian(hamiltonian)
     w0 = PhaseSpacePosition.from_w(np.stack([W, 1.1 * W], axis=-1), galactic)
     orbits = integrate_orbit(h, w0, **TIMES)
     assert orbits.shape == (401, 2)

@@ -165,11 +165,7 @@ def test_problem_from_simulation_refuses():
 
 @pytest.mark.posix
 @pytest.mark.parametrize(
-    "call",
-    [
-        lambda: run("ias15", h=10.0, n_steps=1),
-        lambda: judge.megno(DATA.gm, DATA.y0, t_end=10.0, dt=1.0),
-    ],
+    "call", [lambda: run("ias15", h=10.0, n_steps=1), lambda: judge.megno(DATA.gm, DATA.y0, t_end=10.0, dt=1.0)]
 )
 def test_ctrl_c_is_pythons_again_afterwards(call):
     call()

@@ -217,10 +217,7 @@ def test_bad_input_is_named():
         ({"template": "archive.bin"}, TypeError, r"template must be a rebound\.Simulation"),
     ]
 
-    def call(run=run, *, y=None, **options):
-        return exchange.to_simulation(run, y, **options)
-
-    refuse(call, rows)
+    refuse(lambda run=run, *, y=None, **options: exchange.to_simulation(run, y, **options), rows)
     with pytest.raises(ValueError, match="expected 4 names, all different"):
         exchange.problem_from_simulation(planets(), names=["A", "A", "C", "D"])
     with pytest.raises(TypeError, match="expected a run by integrate"):

@@ -10,13 +10,8 @@ from eip_scipy.methods.nystrom import RKN86, RKN1210, NystromTableau, nystrom_tr
 
 # None is in the package: kick-drift-kick leapfrog, whose last stage is the next first; Nystrom's method of order 4.
 LEAPFROG = {"A": [[], ["1/2"]], "b": ["1/2", 0], "b_prime": ["1/2", "1/2"], "c": [0, 1], "order": 2}
-NYSTROM4 = {
-    "A": [[], ["1/8"], [0, "1/2"]],
-    "b": ["1/6", "1/3", 0],
-    "b_prime": ["1/6", "2/3", "1/6"],
-    "c": [0, "1/2", 1],
-    "order": 4,
-}
+NYSTROM4 = {"A": [[], ["1/8"], [0, "1/2"]], "b": ["1/6", "1/3", 0], "b_prime": ["1/6", "2/3", "1/6"]}
+NYSTROM4 |= {"c": [0, "1/2", 1], "order": 4}
 PAIR = {**LEAPFROG, "b_hat": ["1/2", 0], "b_prime_hat": [1, 0], "error_estimator_order": 1}
 HIGH = [RKN86, RKN1210]
 # The position weights satisfy only the first moment.

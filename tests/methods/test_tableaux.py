@@ -12,7 +12,6 @@ from eip_scipy.methods import Tableau
 from eip_scipy.methods.runge_kutta import DOP853, RK1, RK2, RK3, RK4, RK5, RK23, RK45, rooted_trees
 
 EPS = np.finfo(float).eps
-
 CLASSICAL = {"A": [[], ["1/2"], [0, "1/2"], [0, 0, 1]], "b": ["1/6", "1/3", "1/3", "1/6"]}
 # Kutta's 3/8 rule, Ralston's rule, and Butcher's method of order 6: none of them in the package.
 THREE_EIGHTHS = Tableau("ThreeEighths", [[], ["1/3"], ["-1/3", 1], [1, -1, 1]], ["1/8", "3/8", "3/8", "1/8"], order=4)

@@ -13,12 +13,9 @@ from eip_scipy import EIPDOP853, EIPRK4, EIPRK45, check_gradient, integrate
 from eip_scipy.problems import TOKAMAK, UNIFORM, ParticleField, charged_particle, tokamak, uniform_field
 
 POINTS = [(1.05, 0.0, 0.0), (0.3, -0.9, 0.07), (-0.8, 0.7, -0.2), (1.3, 0.2, 0.5)]
-VELOCITY = pytest.param("velocity", marks=[pytest.mark.nightly, pytest.mark.slow])
+VELOCITY = pytest.param("velocity", marks=pytest.mark.nightly)
 FORMS = pytest.mark.parametrize("form", ["canonical", VELOCITY])
 MAKERS = pytest.mark.parametrize("make", [uniform_field, tokamak])
-
-
-# --- the paper's fields ---
 
 
 def paper_uniform(x, y, z):
@@ -72,9 +69,6 @@ def test_fields_are_the_papers(field, paper):
         np.testing.assert_array_equal(field.along(key, np.array(POINTS).T), expected)
 
 
-# --- equations and invariants ---
-
-
 @FORMS
 @MAKERS
 def test_invariants_reference_and_order(make, form):
@@ -109,9 +103,6 @@ def test_orientation_of_the_axes_does_not_matter():
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-12)
 
 
-# --- user-defined fields ---
-
-
 constant_a, constant_b = njit(lambda x, y, z: (-y, x, 0.0)), njit(lambda x, y, z: (0.0, 0.0, 2.0))
 constant_e = njit(lambda x, y, z: (0.0, 0.3, 0.0))
 mirror_a = njit(lambda x, y, z: (-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0))
@@ -126,15 +117,11 @@ def mirror_jacobian(x, y, z):
     return (0.0, -b, -y * z), (b, 0.0, x * z), (0.0, 0.0, 0.0)
 
 
-def plain_a(x, y, z):
-    return [-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0]
-
-
-def plain_well(x, y, z):
-    return 0.05 * (x * x + y * y) * (1 + z)
-
-
-PLAIN = ParticleField(plain_a, potential=plain_well, axisymmetric=True)
+PLAIN = ParticleField(
+    lambda x, y, z: [-0.5 * y * (1 + z * z), 0.5 * x * (1 + z * z), 0.0],
+    potential=lambda x, y, z: 0.05 * (x * x + y * y) * (1 + z),
+    axisymmetric=True,
+)
 WHOLE = ParticleField(mirror_a, mirror_jacobian, potential=well, electric=well_force, axisymmetric=True)
 MIRRORS = {  # field, form, names of what is kept
     "plain": (PLAIN, "canonical", "HL"),
@@ -159,9 +146,7 @@ def truth():
     return mirror_run(WHOLE, "canonical")[1]
 
 
-@pytest.mark.parametrize(
-    "name", [k if k in GATE else pytest.param(k, marks=[pytest.mark.nightly, pytest.mark.slow]) for k in MIRRORS]
-)
+@pytest.mark.parametrize("name", [k if k in GATE else pytest.param(k, marks=pytest.mark.nightly) for k in MIRRORS])
 def test_own_field(name, truth):
     field, form, kept = MIRRORS[name]
     run, end = mirror_run(field, form)
@@ -210,7 +195,6 @@ def test_a_wrong_claim_of_symmetry_is_seen():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("form", ["velocity", "canonical"])
 def test_compiled_functions_may_return_integers_and_arrays(form):
@@ -238,16 +222,9 @@ def test_compiled_functions_may_return_integers_and_arrays(form):
     np.testing.assert_array_equal(out, [0, 0, 0, 0, 0, 1])
 
 
-# --- fields that vary, and balances ---
-
-
 def ring_a(t, x, y, z):
     around = (1 + 1e-4 * t) * (0.5 + (x * x + y * y) / 4)
     return -around * y, around * x, 0.0
-
-
-def ring_b(t, x, y, z):
-    return 0.0, 0.0, (1 + 1e-4 * t) * (1 + x * x + y * y)
 
 
 def ring_phi(t, x, y, z):
@@ -260,8 +237,9 @@ def ring_e(t, x, y, z):
 
 
 def ring(**options):
-    given = {"vector_potential": ring_a, "magnetic": ring_b, "electric": ring_e, "axisymmetric": True, "varies": True}
-    return ParticleField(**(given | options))
+    magnetic = lambda t, x, y, z: (0.0, 0.0, (1 + 1e-4 * t) * (1 + x * x + y * y))  # noqa: E731
+    given = {"vector_potential": ring_a, "magnetic": magnetic, "electric": ring_e, "axisymmetric": True}
+    return ParticleField(**(given | options), varies=True)
 
 
 def moving(field, balances=None, t_end=20.0, **options):
@@ -297,9 +275,6 @@ def test_energies_in_fields_that_do_work(field, balances, names):
     assert run.trusted
     exact = solve_ivp(problem.fun, problem.t_span, y, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
     np.testing.assert_allclose(run.y[:, -1], exact, rtol=0, atol=2e-7)
-
-
-# --- wrong input ---
 
 
 def start(field=UNIFORM, position=(1.0, 0, 0), velocity=(0, 0.1, 0), **options):

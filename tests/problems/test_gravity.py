@@ -190,9 +190,6 @@ def test_arguments_are_converted_or_refused():
             call()
 
 
-# Many bodies: energies that come with accelerations, members of ensembles, threads.
-
-
 @pytest.mark.parametrize("method", [EIPRK4, EIPRKN12])
 @pytest.mark.parametrize("compensated", [False, True])
 def test_the_energy_that_comes_with_the_accelerations_has_the_bits_of_the_energy_alone(method, compensated):

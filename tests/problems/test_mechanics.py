@@ -1,6 +1,7 @@
 """Models of SymPy as mechanical systems: their equations, energies, momenta, inputs, parameters, and wrong input."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,16 +112,12 @@ def test_all_kinds_of_models_give_the_same_motion(make, speeds, says):
 
 
 def test_a_system_of_pydy_brings_constants_and_start():
-    model = parabola_by_lagrange()
-
-    class System:  # as PyDy's
-        eom_method, constants = model, WEIGHT
-        initial_conditions = {x: 1, y: 1, x.diff(): 0.5, y.diff(): 1.0}  # noqa: RUF012
-
-    assert mechanics(System()).parameters == {"m": 1, "g": G}
-    np.testing.assert_array_equal(mechanics(System()).y0, [1, 1, 0.5, 1])
+    start = {x: 1, y: 1, x.diff(): 0.5, y.diff(): 1.0}
+    system = SimpleNamespace(eom_method=parabola_by_lagrange(), constants=WEIGHT, initial_conditions=start)
+    assert mechanics(system).parameters == {"m": 1, "g": G}
+    np.testing.assert_array_equal(mechanics(system).y0, [1, 1, 0.5, 1])
     # A constant that is given goes before that of the model.
-    lighter = mechanics(System(), {"g": 1.0})
+    lighter = mechanics(system, {"g": 1.0})
     np.testing.assert_allclose(lighter.motion_at(0.0, lighter.y0)[2], -(4 * 0.25 + 2) / 5, rtol=1e-13)
 
 
@@ -163,9 +160,6 @@ def test_a_pole_of_dependent_speeds_is_none_of_the_motion():
     # At y = x^2, x = 0 the other choice of dependent speeds, u by v, is singular.
     problem = mechanics(on_a_parabola(True), WEIGHT, [0, 0], [0.7, 0])
     assert solve_ivp(problem.motion_at, (0, 0.1), problem.y0, rtol=1e-9, atol=1e-9).success
-
-
-# Energies.
 
 
 def test_springs_of_a_model_belong_to_its_energy():
@@ -257,8 +251,7 @@ def test_inputs_are_expressions_or_functions(pushed, given):
 
 
 @pytest.mark.parametrize(
-    ("given", "force"),
-    [(halving, 0.1), (njit(halving), 0.1), (sympy.sin(TIME) - 3 * x, np.sin(0.5) - 0.6), (0, 0)],
+    ("given", "force"), [(halving, 0.1), (njit(halving), 0.1), (sympy.sin(TIME) - 3 * x, np.sin(0.5) - 0.6), (0, 0)]
 )
 def test_inputs_of_the_state_do_not_change_it(pushed, given, force):
     problem = mechanics(pushed, {m: 2, k: 3}, [0], [1], inputs={"push": given})
@@ -274,13 +267,12 @@ def test_one_function_may_give_several_inputs():
         x.diff() ** 2 / 2 + y.diff() ** 2 / 2, [x, y], forcelist=[(point, push * FRAME.x + pull * FRAME.y)], frame=FRAME
     )
 
-    class System:  # as PyDy's, whose functions take (x, t)
-        eom_method, constants, initial_conditions = model, {}, {x: 0, y: 0, x.diff(): 0, y.diff(): 0}
-        specifieds = {(push, pull): lambda x, t: np.array([np.sin(t), x[2]])}  # noqa: RUF012
-
+    start = dict.fromkeys([x, y, x.diff(), y.diff()], 0)
+    system = SimpleNamespace(eom_method=model, constants={}, initial_conditions=start)  # as PyDy's
+    system.specifieds = {(push, pull): lambda x, t: np.array([np.sin(t), x[2]])}
     functions = lambda t, y: [np.sin(t), y[2]], lambda t, y: [np.sin(t), y[2]] if t < 9 else [0.0, 0.0]
     problems = [mechanics(model, {}, [0, 0], [0, 0], inputs={(push, pull): given}) for given in functions]
-    for problem in (*problems, mechanics(System())):
+    for problem in (*problems, mechanics(system)):
         found = problem.motion_at(0.5, np.array([0.3, 0.4, 0.1, 0.2]))
         np.testing.assert_allclose(found, [0.1, 0.2, np.sin(0.5), 0.1], rtol=1e-15)
 
@@ -302,9 +294,6 @@ def test_a_pendulum_hangs_on_a_point_that_moves(hanging):
     found = problem.motion_at(t, np.array(state))[2:]
     expected = [-0.9 * np.sin(3 * t), 0] + by_angle * np.array([np.cos(a), np.sin(a)])
     np.testing.assert_allclose(found, expected - rate**2 * np.array([np.sin(a), -np.cos(a)]), rtol=1e-14)
-
-
-# Momenta and quaternions.
 
 
 def test_momenta_of_cyclic_coordinates_are_kept():
@@ -362,9 +351,6 @@ def test_norms_of_quaternions_are_kept():
         mechanics(model, {}, [1, 0.1, 0, 0, 0, 0, 0], speeds)
 
 
-# Parameters.
-
-
 def test_parameters_are_given_by_name_or_symbol(pushed):
     options = {"t_span": (0, 2), "inputs": {push: 0}, "outputs": {"spring": k * x}}
     problem = mechanics(pushed, {m: 2, "k": 3}, [1], [0], **options)
@@ -389,9 +375,6 @@ def test_outputs_and_starts_take_the_parameters_of_the_run():
     np.testing.assert_allclose(problem.multipliers(0.0, starts[1], {l: 0.75}).values, [expected], rtol=1e-14)
 
 
-# Wrong input.
-
-
 def two_quantities(one, two):
     return f"two different quantities are called .*{one}.* and .*{two}"
 
@@ -414,10 +397,7 @@ NAME_OF_X, NAME_OF_RATE, RATE = sympy.Symbol("x"), sympy.Symbol("v_x"), me.dynam
     ],
 )
 def test_different_quantities_have_different_names(force, params, says):
-    for model in (
-        on_a_line(force, speed=RATE, by_rate=True),
-        me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x]),
-    ):
+    for model in (on_a_line(force, speed=RATE, by_rate=True), me.LagrangesMethod(x.diff() ** 2 / 2 + x * force, [x])):
         with pytest.raises(ValueError, match=says):
             mechanics(model, params, [1], [0])
 

@@ -13,23 +13,11 @@ from eip_scipy.problems import mechanics, mechanism
 G = 9.81
 OPTIONS = {"method": EIPDOP853, "h": 0.02}
 TIGHT = {"method": EIPDOP853, "rtol": 1e-12, "atol": 1e-12}
-LATER = (pytest.mark.nightly, pytest.mark.slow)  # each jitted system takes many seconds to compile
+LATER = pytest.mark.nightly  # each jitted system takes many seconds to compile
 
 
 def plain(function):
     return function
-
-
-def torque(t, q, u):
-    return np.array([-G * np.sin(q[0])])
-
-
-def potential(t, q):
-    return -G * np.cos(q[0])
-
-
-def mass_of_two(q):
-    return np.array([[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]])
 
 
 def forces_on_two(t, q, u):
@@ -42,42 +30,29 @@ def driven(t, q, u):
     return np.array([-q[0] - 0.1 * q[1] ** 2, -q[1] - 0.2 * q[0] * q[1] - 0.1 * u[1], last])
 
 
-def circle(t, q):
-    return np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2])
-
-
 def twice(t, q):
     return np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2, np.sqrt(q[0] ** 2 + q[1] ** 2) - 1])
 
 
-def moving(t, q):
-    return np.array([((q[0] - np.sin(t)) ** 2 + q[1] ** 2 - 1) / 2])
-
-
-def sphere(t, q):
-    return np.array([(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 - 1) / 2])
-
-
-def skate(t, q, u):
-    return np.array([u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])])
-
-
-PENDULUM = {"mass": [1.0], "forces": torque, "q0": [1.0], "u0": [0], "potential_energy": potential}
+MOVING = {"constraints": lambda t, q: np.array([((q[0] - np.sin(t)) ** 2 + q[1] ** 2 - 1) / 2]), "u0": [1, 0]}
+SPHERE = {"constraints": lambda t, q: np.array([(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 - 1) / 2]), "u0": [0, 0.5, 0.3]}
+SKATE = {"velocity_constraints": lambda t, q, u: np.array([u[0] * np.sin(q[2]) - u[1] * np.cos(q[2])])}
+SKATE |= {"q0": [0, 0, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.7]}
+PENDULUM = {"mass": [1.0], "forces": lambda t, q, u: np.array([-G * np.sin(q[0])]), "q0": [1.0], "u0": [0]}
+PENDULUM |= {"potential_energy": lambda t, q: -G * np.cos(q[0])}
+MASS = lambda q: np.array([[2.0, np.cos(q[0] - q[1])], [np.cos(q[0] - q[1]), 1.0]])  # noqa: E731
 FALLING = {"mass": [1, 1], "forces": [0, -G], "q0": [1, 0], "u0": [0, 0.5]}
 SYSTEMS = {
     "1, free": PENDULUM,
     "1, other speed": PENDULUM | {"kinematics": lambda t, q, u: u * (1 + q[0] ** 2)},
-    "2, free": {"mass": mass_of_two, "forces": forces_on_two, "q0": [1, 0.5], "u0": [0, 0.2]},
-    "2, circle": FALLING | {"constraints": circle},
+    "2, free": {"mass": MASS, "forces": forces_on_two, "q0": [1, 0.5], "u0": [0, 0.2]},
+    "2, circle": FALLING | {"constraints": lambda t, q: np.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2])},
     "2, circle twice": FALLING | {"constraints": twice},
-    "2, moving circle": FALLING | {"constraints": moving, "u0": [1, 0]},
+    "2, moving circle": FALLING | MOVING,
     "3, free": {"mass": [1, 2, 3], "forces": driven, "q0": [1, 0.5, 0.3], "u0": [0, 0.1, 0]},
-    "3, sphere": {"mass": [1, 1, 1], "forces": [0, 0, -G], "constraints": sphere, "q0": [1, 0, 0], "u0": [0, 0.5, 0.3]},
-    "3, skate": {
-        "mass": [1, 1, 0.5], "forces": [0, G * 0.1, 0], "velocity_constraints": skate,
-        "q0": [0, 0, 0.3], "u0": [np.cos(0.3), np.sin(0.3), 0.7],
-    },
-}  # fmt: skip
+    "3, sphere": {"mass": [1, 1, 1], "forces": [0, 0, -G], "q0": [1, 0, 0]} | SPHERE,
+    "3, skate": {"mass": [1, 1, 0.5], "forces": [0, G * 0.1, 0]} | SKATE,
+}
 
 
 def system(name, jit=njit):
@@ -112,7 +87,6 @@ def flow_differences(problem, directions, step=1e-4):
 
 @pytest.mark.needs_jit
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_columns_are_differences_of_the_flow(name):
     """The flow is that of functions that are not jitted, whose compilation would take as long again."""
@@ -132,7 +106,7 @@ def period_and_slope(angle, omega):
     return 4 * K / omega, 4 * slope / omega
 
 
-@pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[*LATER, pytest.mark.needs_jit])])
+@pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[LATER, pytest.mark.needs_jit])])
 def test_matrix_of_a_pendulum_after_its_period(jit):
     period, slope = period_and_slope(1.0, np.sqrt(G))
     run = integrate(system("1, free", jit), t_span=(0, period), variations="state", **TIGHT)

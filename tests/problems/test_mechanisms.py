@@ -8,22 +8,13 @@ import pytest
 from numba import njit
 from scipy.special import ellipk
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPRK4,
-    Balance,
-    EIPRadau,
-    Invariant,
-    ensemble,
-    integrate,
-    load,
-)
+from eip_scipy import EIPDOP853, EIPRK4, Balance, EIPRadau, Invariant, ensemble, integrate, load
 from eip_scipy.problems import kepler, mechanism
 from eip_scipy_studies.bench import mechanisms as examples
 
 G = 9.81
 STATE = np.array([0.8, -0.6, 0.3, 0.4])
-NIGHTLY = (pytest.mark.nightly, pytest.mark.slow)
+NIGHTLY = pytest.mark.nightly
 
 
 def plain(function):
@@ -31,7 +22,7 @@ def plain(function):
 
 
 # Functions that are jitted take many seconds to compile: most tests are of plain ones.
-JITS = pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[*NIGHTLY, pytest.mark.needs_jit])])
+JITS = pytest.mark.parametrize("jit", [plain, pytest.param(njit, marks=[NIGHTLY, pytest.mark.needs_jit])])
 
 
 def run(problem, tolerance, **options):
@@ -175,9 +166,6 @@ def test_results_and_states_without_outputs(released):
             getattr(result, name)
 
 
-# Functions of users.
-
-
 def test_functions_may_change_their_arguments_and_return_the_same_array():
     kept = np.empty(1)
 
@@ -261,8 +249,6 @@ def test_a_start_is_found_and_what_is_set_is_not_moved():
     np.testing.assert_allclose(below, [0.6, -0.8, 0.5, 0.375], rtol=1e-14)
 
 
-# Energies.
-
 PENDULUM = {"constraints": length, "q0": [1, 0], "u0": [0, 0]}
 WITH_POTENTIAL = PENDULUM | {"potential_energy": potential}
 SPRING = {"q0": [0], "u0": [0], "potential_energy": lambda t, q: q[0] ** 2 / 2}
@@ -310,10 +296,6 @@ def test_a_given_power_is_that_of_the_energy(jit):
 # Wrong input. Each row: some words, what differs from the pendulum, and the kind of error.
 
 
-def skewed(q):
-    return np.array([[1, q[0]], [0, 1]])
-
-
 def on_a_line(t, q):
     return [q[0] - 1]
 
@@ -327,7 +309,7 @@ WRONG = [
     ("t is the time", {"coordinates": "t x"}),
     ("t is the time", {"speeds": "t x"}),
     (r"entries \[0, 1\] and \[1, 0\] are 0.05 and 0.* only the diagonal", {"mass": [[1, 0.05], [0, 1]]}),
-    ("mass must be a symmetric matrix", {"mass": skewed}),
+    ("mass must be a symmetric matrix", {"mass": lambda q: np.array([[1, q[0]], [0, 1]])}),
     *(("mass must be positive for motions that the constraints allow", {"mass": mass, "constraints": None})
       for mass in ([1, -1e-9], [-1, -1], [[0, 1], [1, 0]])),
     # On the circle, at (1, 0), only the second component moves.
@@ -369,9 +351,6 @@ def test_masses_that_the_constraints_make_positive():
     mechanism([[1.0, 0.1 * 3], [0.3, 1.0]], [0, -G], q0=[1, 0], u0=[0, 0])
 
 
-# Mechanisms with known motions.
-
-
 def test_no_step_ends_next_to_a_singular_position():
     problem = examples.n_four_bar(1, t_end=3.0)
     (kept,) = problem.constraints
@@ -388,7 +367,6 @@ def test_no_step_ends_next_to_a_singular_position():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "tolerance", "end", "error"),
     [
@@ -408,7 +386,6 @@ def test_known_motions(make, tolerance, end, error):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_bricards_mechanism_has_redundant_constraints():
     problem = examples.bricard()
     assert "24 on velocities of rank 23, 1 degree of freedom" in repr(problem)

@@ -176,9 +176,6 @@ def test_many_bodies():
         assert np.abs(by_law).max() > 0
 
 
-# The choice of centres.
-
-
 def test_the_moon_moves_about_the_earth():
     problem = solar_system("de440-moon", years=1)
     bodies = list(solar_data.load("de440-moon").bodies)
@@ -250,8 +247,6 @@ def test_balances_are_pickled():
             np.testing.assert_array_equal(one[0], other[0])
             np.testing.assert_array_equal(one[1], other[1])
 
-
-# Wrong input.
 
 GM, Y = system(5)
 WRONG = [
@@ -352,9 +347,6 @@ def test_rates_of_the_same_pass_and_of_a_pass_of_their_own_have_the_same_bits(n)
             assert (fused.calls["acceleration"], apart.calls["acceleration"]) == ("native", "python")
             np.testing.assert_array_equal(fused.y, apart.y)
             np.testing.assert_array_equal(fused.invariants, apart.invariants)
-
-
-# Runs.
 
 
 @pytest.mark.parametrize("quantities", ["kepler", ALL])

@@ -11,7 +11,6 @@ from eip_scipy import EIPDOP853, EIPGJ12, Balance, hamiltonian, integrate
 
 sympy = pytest.importorskip("sympy")
 pytestmark = pytest.mark.needs_jit
-
 KEPLER = "(px**2 + py**2)/2 - 1/sqrt(x**2 + y**2)"
 MOMENTUM = {"H": KEPLER, "L": "x*py - y*px"}
 

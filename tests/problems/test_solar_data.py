@@ -60,9 +60,6 @@ def heliocentric_km(data, body):
     return q * AU_KM, v * AU_KM / DAY_S
 
 
-# The embedded sets.
-
-
 def test_available_sets_and_their_errors():
     assert solar_data.available() == NAMES
     for call, says in [
@@ -118,9 +115,6 @@ def test_the_exact_epoch_is_that_of_the_calendar():
     assert abs(Fraction(data.epoch_jd_tdb) + Fraction(data.epoch_rest) - whole) < 1e-15
 
 
-# The reference states.
-
-
 @pytest.fixture(scope="module")
 def planetary():
     """Return the problem of the set de440, in days."""
@@ -145,9 +139,6 @@ def test_states_keep_the_invariants_of_the_initial_data(planetary):
 def test_first_year_against_scipy(planetary):
     sol = solve_ivp(planetary.fun, (0, YEAR_D), planetary.y0, method="DOP853", rtol=1e-13, atol=1e-16)
     assert_allclose(sol.y[:, -1], solar_data.reference_states()[1.0], rtol=0, atol=1e-11)
-
-
-# The paper's set.
 
 
 def test_the_papers_sun_is_added():
@@ -175,9 +166,6 @@ def test_mars_misprint(planets):
     assert_allclose(corrected[2] * 1e3, -3.711433859326417e02, rtol=1e-14)
     assert_allclose(corrected, planets["Mars"][1], rtol=0, atol=1e-7)
     assert_allclose(printed[:2], corrected[:2], rtol=1e-14)
-
-
-# The kernel.
 
 
 def test_embedded_sets_come_from_the_kernel(kernel, tmp_path):

@@ -17,17 +17,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from systems import DOUBLE_PENDULUM, HENON_HEILES, INERTIA, RELATIVISTIC_KEPLER, RIGID_BODY, SO3, TWO_RODS
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRKN12,
-    check_gradient,
-    ensemble,
-    equations,
-    hamiltonian,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRKN12, check_gradient, ensemble, equations, hamiltonian, integrate
 from eip_scipy.problems import kepler
 
 MOMENTUM = {"L": "x*py - y*px"}
@@ -47,8 +37,6 @@ def values(problem, y):
     function(0.0, np.array(y, dtype=float), out, *([] if problem.params is None else [problem.params]))
     return out
 
-
-# The reader.
 
 VALUES = {
     "2*pi": 2 * math.pi, ".1 + .2": 0.3, "1e-3": 0.001, "2**0.5": math.sqrt(2), "-2**2": -4, "2 - 3 - 4": -5,
@@ -159,9 +147,6 @@ def test_piecewise_and_reciprocals_are_those_of_sympy():
         np.testing.assert_allclose(values(problem, point), expected, rtol=1e-14)
 
 
-# Names: those that are paired, and parameters.
-
-
 @pytest.mark.parametrize(
     ("H", "names"),
     [
@@ -198,9 +183,6 @@ def test_parameters_by_name_in_runs(orbit):
     for y0, params in (([1.0, 0.0, 0.0], None), (np.ones(6), None), (np.ones(4), [1.0, 2.0]), (np.ones(4), [])):
         with pytest.raises(ValueError, match="must hold as many numbers as there are names in"):
             integrate(orbit, (0, 1), y0, params=params, method=EIPRK4, h=0.1)
-
-
-# Equations, energies, gradients.
 
 
 def test_nystrom_and_multistep_methods_take_it(orbit):
@@ -252,7 +234,7 @@ def pendulum():
 @pytest.mark.parametrize(
     ("make", "y0", "end"),
     [(lambda: hamiltonian(HENON_HEILES), [0.0, 0.1, 0.5, 0.0], 100),
-     pytest.param(pendulum, [1.0, 0.5, 0.2, -0.1], 5, marks=[pytest.mark.nightly, pytest.mark.slow])],
+     pytest.param(pendulum, [1.0, 0.5, 0.2, -0.1], 5, marks=pytest.mark.nightly)],
 )  # fmt: skip
 def test_runs_are_those_of_scipy_and_forces_are_gradients(make, y0, end):
     problem, y0, grad = make(), np.array(y0), np.empty(4)
@@ -404,9 +386,6 @@ def test_wrong_arguments(call):
         options = arguments[-1] if len(arguments) > 1 and isinstance(arguments[-1], dict) else {}
         with pytest.raises(kind, match=says):
             call(*arguments[: len(arguments) - bool(options)], **options)
-
-
-# Functions: jitted or not, in ensembles, in other processes.
 
 
 def test_cube_roots_are_real():

@@ -33,10 +33,6 @@ def spring_of_two(t, q):
     return [-4 * x, -4 * y]
 
 
-def spring_with_rate(t, q, params):
-    return -params[0] * q
-
-
 def field(t, y):
     return np.append(y[2:], -4 * y[:2])
 
@@ -56,7 +52,7 @@ def test_accelerations_and_fields_of_second_order_methods(method):
     ways = [{"fun": field}, {"fun": JITTED[field]}]
     ways += [{"acceleration": fun} for fun in (spring, JITTED[spring])]
     ways += [{"acceleration": fun, "in_place": True} for fun in (spring_in_place, JITTED[spring_in_place])]
-    ways += [{"acceleration": spring_with_rate, "params": [4.0], "invariants": ENERGY}]
+    ways += [{"acceleration": lambda t, q, params: -params[0] * q, "params": [4.0], "invariants": ENERGY}]
     for way in ways:
         run = integrate(t_span=(0, 3), y0=Y0, method=method, **SECOND_ORDER[method], **way)
         np.testing.assert_allclose(run.y[:, -1], exact(3), rtol=0, atol=2e-10)

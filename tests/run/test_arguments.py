@@ -34,7 +34,6 @@ crosses.terminal, crosses.direction = 1, -1.0
 jit_oscillator, jit_energy, jit_gradient = njit(oscillator), njit(energy), njit(energy_gradient)
 jit_crosses = njit(crosses)
 jit_crosses.terminal, jit_crosses.direction = 1, -1.0
-
 PYTHON = oscillator, Invariant(energy, energy_gradient, name="H"), crosses
 JITTED = jit_oscillator, Invariant(jit_energy, jit_gradient, name="H"), jit_crosses
 NO_GRADIENT = jit_oscillator, Invariant(jit_energy, name="H"), jit_crosses
@@ -94,14 +93,8 @@ def test_one_array_is_params():
     np.testing.assert_array_equal(by_args.y, by_params.y)
 
 
-@njit
-def oscillator_of(t, y, p):
-    return np.array([y[1], -p[0] * y[0] / p[1]])
-
-
-@njit
-def oscillator_of_both(t, y, p, m):
-    return np.array([y[1], -p[0] * y[0] / m])
+oscillator_of = njit(lambda t, y, p: np.array([y[1], -p[0] * y[0] / p[1]]))
+oscillator_of_both = njit(lambda t, y, p, m: np.array([y[1], -p[0] * y[0] / m]))
 
 
 def test_other_arguments_are_python_s():

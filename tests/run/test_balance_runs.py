@@ -12,16 +12,7 @@ from systems import BALANCES, QUARTIC_PARAMS, QUARTIC_START, swinging
 from systems import quartic_energy as energy
 from systems import quartic_rate as rate
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRK45,
-    Balance,
-    Invariant,
-    ProjectionWarning,
-    integrate,
-)
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK45, Balance, Invariant, ProjectionWarning, integrate
 from eip_scipy.checkpoint import CheckpointError
 
 RUNS = [
@@ -132,19 +123,9 @@ def test_a_run_is_continued(options):
         assert np.isfinite(found.diagnostics.slowness).all()
 
 
-@njit
-def driven(t, y, p):
-    return np.array([y[1], -y[0] - 0.02 * y[1] + 0.01 * np.cos(2 * t)])
-
-
-@njit
-def plain_energy(t, y, p):
-    return 0.5 * (y[0] ** 2 + y[1] ** 2)
-
-
-@njit
-def power(t, y, p):
-    return -0.02 * y[1] ** 2 + 0.01 * y[1] * np.cos(2 * t)
+driven = njit(lambda t, y, p: np.array([y[1], -y[0] - 0.02 * y[1] + 0.01 * np.cos(2 * t)]))
+plain_energy = njit(lambda t, y, p: 0.5 * (y[0] ** 2 + y[1] ** 2))
+power = njit(lambda t, y, p: -0.02 * y[1] ** 2 + 0.01 * y[1] * np.cos(2 * t))
 
 
 @pytest.mark.filterwarnings("ignore:balance 'E' changes too fast:UserWarning")

@@ -25,9 +25,6 @@ from eip_scipy.checkpoint import CheckpointError
 Y0 = pericentre(0.6)
 
 
-# Resuming, bit for bit.
-
-
 def crossing(t, y):
     return y[1]
 
@@ -36,14 +33,7 @@ def falling(t, y):
     return y[0]
 
 
-def third(t, y):
-    return y[1]
-
-
 falling.direction = -1
-third.terminal = 2
-
-
 FRAME = (np.array([[1.0, 2.0, 0.0, 0.0]]), np.array([[0.5], [0.25], [0.0], [0.0]]))
 FIXED = {"method": EIPRK4, "h": 0.03, "invariants": [H, L], "save_every": 7}
 
@@ -79,16 +69,11 @@ def test_broken_off_inside_a_step(case, tmp_path):
         partial = info.value.partial
         np.testing.assert_array_equal(partial.t[:-1], whole.t[: partial.t.size - 1])
         found = run(resume=True, **options)
-        step = checkpoint_step(info.value)
+        (note,) = info.value.__notes__
+        step = int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
         assert found.message.startswith(f"reached the end of the interval (resumed at step {step}")
         assert step > 0 or last == 9
         same(whole, found)
-
-
-def checkpoint_step(error):
-    """Return the step that the note of an exception names."""
-    (note,) = error.__notes__
-    return int(re.search(r"holds step (\d+), t = [-\d.e]+: the same call with resume=True continues", note)[1])
 
 
 @pytest.mark.usefixtures("fine")
@@ -126,9 +111,6 @@ def test_a_failed_run_fails_again(tmp_path):
     same(run(), run(checkpoint=path, resume=True))
 
 
-# When checkpoints are written.
-
-
 def test_checkpoint_every(tmp_path, times_written):
     written = times_written(run, tmp_path / "a", 0.5)
     np.testing.assert_allclose([t for t, _, _ in written], [0.0, 0.5, 1.0, 1.5, 2.0], atol=0.025)
@@ -139,9 +121,6 @@ def test_checkpoint_every(tmp_path, times_written):
     gaps = np.diff([t for t, _, _ in times_written(run, tmp_path / "c", 0.01, seconds=0.02)])[:-1]
     assert gaps.size > 3
     np.testing.assert_allclose(gaps, 0.425, atol=0.026)
-
-
-# Files that are there, that are not, and runs that do not fit.
 
 
 def test_options_and_places(tmp_path, monkeypatch):
@@ -172,15 +151,8 @@ def test_options_and_places(tmp_path, monkeypatch):
     same(run(), new)
 
 
-OTHERS = {
-    "method": EIPRK5,
-    "h": 0.02,
-    "rtol": 1e-4,
-    "invariants": [H],
-    "metric": "euclidean",
-    "blocks": 2,
-    "linear_invariants": FRAME,
-}
+OTHERS = {"method": EIPRK5, "h": 0.02, "rtol": 1e-4, "invariants": [H], "metric": "euclidean", "blocks": 2}
+OTHERS |= {"linear_invariants": FRAME}
 OTHERS |= {"direction": "midpoint", "iterations": 2, "every": 2, "reuse_f": False, "compensated": True, "save_every": 8}
 OTHERS |= {"events": crossing, "y0": pericentre(0.5), "t_span": (0, 7)}
 
@@ -267,9 +239,6 @@ def test_other_versions_are_a_warning(old_run, tmp_path, monkeypatch):
     same(old_run[0], found)
 
 
-# The file.
-
-
 def test_header_and_arrays(tmp_path):
     path = tmp_path / "a.npz"
     arrays = {
@@ -303,9 +272,6 @@ def test_header_and_arrays(tmp_path):
             os.utime(tmp_path / name, (time.time() - 4000,) * 2)
     checkpoint.write(path, {"kind": "test"}, {})
     assert {entry.name for entry in tmp_path.iterdir()} == {"a.npz", *names[1:]}
-
-
-# Damage.
 
 
 def small_file(path):
@@ -342,13 +308,13 @@ def test_mutations(data, tmp_path):
     assert outcome(path) in (known, "refused")
 
 
-def forged(path, name, member, header=None):
+HEADER = {"format": "eip_scipy checkpoint", "schema": 1}
+
+
+def forged(path, name, member, **header):
     """Write a file with the given bytes of one member and the header."""
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(
-            "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [name[:-4]], **(header or {})}),
-        )
+        archive.writestr("header.json", json.dumps(HEADER | {"arrays": [name[:-4]]} | header))
         archive.writestr(name, member)
 
 
@@ -393,17 +359,14 @@ def test_foreign_archives(tmp_path):
         (old.getvalue(), {}, r"x\.npy does not have version 1\.0 of the npy format"),
     ]
     for member, header, words in rows:
-        forged(path, "x.npy", member, header)
+        forged(path, "x.npy", member, **header)
         refuse(checkpoint.read, [({"path": path}, CheckpointError, words)])
     np.savez(path, x=np.arange(3))
     with pytest.raises(CheckpointError, match=r"not a checkpoint of eip_scipy: .* its members are \['x\.npy'\]"):
         checkpoint.read(path)
     # Members of the same bytes: 40 arrays of 1 kB in a file of a few.
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(
-            "header.json",
-            json.dumps({"format": "eip_scipy checkpoint", "schema": 1, "arrays": [f"x{k}" for k in range(40)]}),
-        )
+        archive.writestr("header.json", json.dumps(HEADER | {"arrays": [f"x{k}" for k in range(40)]}))
         archive.writestr("x0.npy", npy_bytes("<f8", (128,), bytes(1024)))
         first = archive.filelist[-1]
         for k in range(1, 40):
@@ -417,9 +380,6 @@ def test_foreign_archives(tmp_path):
         archive.writestr("header.json", bytes(10**7))
     with pytest.raises(CheckpointError, match="compressed"):
         checkpoint.read(path)
-
-
-# Disks that are full.
 
 
 class FullDisk(io.FileIO):
@@ -438,21 +398,14 @@ class FullDisk(io.FileIO):
         return super().write(data)
 
 
-def fill_disk(patch, writes):
-    """From now on, fill the disk at the write of this number."""
-    room = [writes]
-    patch.setattr(
-        checkpoint, "open", lambda path, mode: io.BufferedWriter(FullDisk(path, mode, room), 16), raising=False
-    )
-    return room
-
-
 def test_a_full_disk_at_each_write(tmp_path, monkeypatch):
     path = tmp_path / "a"
     before, messages = small_file(path), set()
     for writes in range(1, 10**6):
         with monkeypatch.context() as patch:
-            room = fill_disk(patch, writes)
+            room = [writes]
+            full = lambda path, mode, room=room: io.BufferedWriter(FullDisk(path, mode, room), 16)  # noqa: E731
+            patch.setattr(checkpoint, "open", full, raising=False)
             try:
                 checkpoint.write(path, {"kind": "new"}, {"x": np.arange(100)})
                 break

@@ -149,10 +149,6 @@ def chain_energy(t, y):
     return total
 
 
-def squares(t, y):
-    return np.sum(y**2)
-
-
 def pulse(m):
     return np.concatenate([np.exp(-(np.linspace(-4, 4, m) ** 2)), np.zeros(m)])
 
@@ -162,7 +158,7 @@ def pulse(m):
 def test_gradients_of_a_large_grid_are_made_of_f_or_their_cost_is_told(compiled):
     """An energy needs no evaluation of its gradient; for a mass the warning appears once, with what to write."""
     m = LARGE // 2
-    fun, energy, mass = (njit(g) if compiled else g for g in (chain, chain_energy, squares))
+    fun, energy, mass = (njit(g) if compiled else g for g in (chain, chain_energy, lambda t, y: np.sum(y**2)))
     options = {"method": EIPRK4, "h": 0.05}
     run = integrate(fun, (0, 0.1), pulse(m), invariants=Invariant(energy, name="H"), **options)
     assert run.compiled == compiled

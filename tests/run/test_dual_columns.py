@@ -21,14 +21,7 @@ def CALL(state, out):
     f[0], f[1] = y[1], -math.sin(y[0])
 
 
-@njit
-def pendulum(t, y):
-    return np.array([y[1], -np.sin(y[0])])
-
-
-@njit
-def product(t, y, dy):
-    return np.array([dy[1], -np.cos(y[0]) * dy[0]])
+pendulum = njit(lambda t, y: np.array([y[1], -np.sin(y[0])]))
 
 
 @njit
@@ -74,6 +67,7 @@ def test_functions_that_depend_on_the_memory_of_arrays_are_refused(fun, reason):
         integrate(fun, SPAN, START, variations="state", **options)
     assert "it is not compiled" not in str(error.value)
     if fun is not by_complex_numbers:
+        product = njit(lambda t, y, dy: np.array([dy[1], -np.cos(y[0]) * dy[0]]))
         run = integrate(fun, SPAN, START, variations="state", jvp=product, **options)
         np.testing.assert_array_equal(run.y, plain.y)
         right = integrate(pendulum, SPAN, START, variations="state", **OPTIONS)
@@ -123,14 +117,8 @@ def test_wrong_derivatives_of_right_values_are_replaced(monkeypatch):
         integrate(without_complex_numbers, SPAN, START, variations="state", **OPTIONS)
 
 
-@njit
-def kinked(t, y):
-    return np.array([y[1], -y[0] - 3 * max(y[0], 0.0) - abs(y[1]) * y[1]])
-
-
-@njit
-def with_many_digits(t, y):
-    return np.array([(y[1] + 1e8) - 1e8, -y[0]])
+kinked = njit(lambda t, y: np.array([y[1], -y[0] - 3 * max(y[0], 0.0) - abs(y[1]) * y[1]]))
+with_many_digits = njit(lambda t, y: np.array([(y[1] + 1e8) - 1e8, -y[0]]))
 
 
 @njit

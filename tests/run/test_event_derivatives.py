@@ -155,16 +155,13 @@ def test_an_event_of_time_and_parameters():
 
 
 def test_events_without_derivatives():
-    def top(t, y):
-        return y[0] - (1 - 1e-14)
-
     def on_the_circle_only(t, y):
         if abs(y @ y - 1) > 1e-4:
             raise ArithmeticError("off the circle")
         return y[1]
 
     options = {"method": EIPDOP853, "h": 0.1, "variations": "state"}
-    events = [top, lambda t, y: y[1], on_the_circle_only]
+    events = [lambda t, y: y[0] - (1 - 1e-14), lambda t, y: y[1], on_the_circle_only]
     run = integrate(lambda t, y: [y[1], -y[0]], (0, 3.5), [0.0, 1.0], events=events, **options)
     assert run.success
     assert run.t_events[0].size

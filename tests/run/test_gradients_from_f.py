@@ -245,9 +245,6 @@ def test_other_systems(system, y0, holds):
     np.testing.assert_allclose(found.y[:, -1], expected.y[:, -1], rtol=0, atol=1e-8)
 
 
-# After the start.
-
-
 def changing(what, since=1.0):
     """A chain with something that begins at the time `since`: f, H, and whether H is kept."""
     fun, energy = chain("FPUT", "pendulums")

@@ -68,9 +68,6 @@ def at_once(action):
     return callback
 
 
-# Location of a file.
-
-
 @keeping
 def test_a_relative_path_is_that_of_the_start(keep, tmp_path, monkeypatch):
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
@@ -84,8 +81,6 @@ def test_a_relative_path_is_that_of_the_start(keep, tmp_path, monkeypatch):
     monkeypatch.chdir(here)
     same(whole, keep("kept", resume=True))
 
-
-# One run at a time.
 
 IN_USE = rf"in use by another run \(process {os.getpid()} on \S+, this one\)\. Wait until that run ends"
 
@@ -207,9 +202,6 @@ def test_one_holder_at_any_time(tmp_path):
     assert most == [1]
     assert taken[0] > 10
     assert content(tmp_path) == []
-
-
-# SIGTERM.
 
 
 @posix

@@ -52,9 +52,6 @@ all_of_them = pytest.mark.parametrize("how", [interpreted, pytest.param(compiled
 KEPT = Invariant(square, square_gradient, name="S")
 
 
-# Functions that write to what they are given.
-
-
 def writing_now_and_then(t, y):
     if t > 0.55:
         y[:] = 7.0 * y
@@ -90,7 +87,6 @@ WRITERS = [writing_now_and_then, writing_by_a_function]
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @all_of_them
 def test_right_hand_sides_that_write(how):
     """Also where SciPy takes the steps, whose own class lets them write to its state."""
@@ -137,19 +133,8 @@ def test_helpers_keep_what_they_are_given():
     np.testing.assert_array_equal(y, Y0)
 
 
-# Functions in place that do not fill.
-
-
-def returning(t, y, out):
-    return np.array([y[1], -y[0]])
-
-
 def half(t, y, out):
     out[0] = y[1]
-
-
-def nothing(t, y, out):
-    pass
 
 
 def adding(t, y, out):
@@ -158,9 +143,9 @@ def adding(t, y, out):
 
 
 NOT_FILLING = [
-    (returning, TypeError, r"returned array\(.*must fill its argument out"),
+    (lambda t, y, out: np.array([y[1], -y[0]]), TypeError, r"returned array\(.*must fill its argument out"),
     (half, ValueError, "does not fill all of its argument out, in component 1"),
-    (nothing, ValueError, "does not fill all of its argument out, in component 0"),
+    (lambda t, y, out: None, ValueError, "does not fill all of its argument out, in component 0"),
     (adding, ValueError, "reads its argument out, whose content is arbitrary, before filling it, in component 0"),
 ]
 
@@ -198,8 +183,6 @@ def test_an_invariant_that_raises_ends_the_run_with_its_error(how):
     assert 0.4 <= caught.value.partial.t[-1] <= 0.6
 
 
-# Values that change on the way.
-
 CHANGES = {
     "complex": (lambda y: y + 0j, "complex"),
     "text": (lambda y: "1.0", "'1.0'"),
@@ -224,9 +207,6 @@ def test_values_that_change():
                 how(**options)
             assert re.search(r"at t=0\.5\b", str(info.value))
             assert how is scipy_s or info.value.partial.t[-1] == 0.4
-
-
-# Exceptions before the first step.
 
 
 class MineError(Exception):

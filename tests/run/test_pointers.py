@@ -26,6 +26,16 @@ Y0, MU = np.array([1.6, 0.0, 0.0, 0.5]), [1.0]
 GRADIENT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[NUMBERS] * 4)
 
 
+def circle(t, y, out, params):
+    out[0], out[1] = y[1], -y[0]
+    return 0
+
+
+def square(t, y, value, params):
+    value[0] = y[0] * y[0] + y[1] * y[1]
+    return 0
+
+
 def twice(t, y, f, out, params):
     out[0], out[1] = 2 * y[0], 2 * y[1]
     return 0
@@ -58,9 +68,6 @@ def value(function):
 
 def gradient(function):
     return LowLevelCallable(GRADIENT(function))
-
-
-# Functions in Python with the same arithmetic.
 
 
 def orbit(t, y, p):
@@ -141,17 +148,10 @@ def test_invariants_of_several_values(c, options):
     assert one.max_residual.max() < 1e-10
 
 
-# Ways to hand them over.
-
-
-def declared(name):
-    return f"int {name}(double, const double *, double *, const double *);"
-
-
 def test_all_kinds_of_pointers(c, library):
     options = {"method": EIPRK4, "h": 0.05, "params": MU}
     ffi = cffi.FFI()
-    ffi.cdef(declared("kepler"))
+    ffi.cdef("int kepler(double, const double *, double *, const double *);")
     opened = ffi.dlopen(library)
     spaced = LowLevelCallable(opened.kepler, signature="int(double,const double*, double  *,double const *)")
     address = ctypes.cast(c.kepler.function, ctypes.c_void_p).value
@@ -166,15 +166,6 @@ def test_all_kinds_of_pointers(c, library):
 
 def test_the_run_holds_the_only_reference():
     """The user's references to the function are gone with its ctypes object, or with that of cffi."""
-
-    def circle(t, y, out, params):
-        out[0], out[1] = y[1], -y[0]
-        return 0
-
-    def square(t, y, value, params):
-        value[0] = y[0] * y[0] + y[1] * y[1]
-        return 0
-
     ffi = cffi.FFI()
     made = {
         "ctypes": lambda: value(circle),
@@ -189,9 +180,6 @@ def test_the_run_holds_the_only_reference():
         np.testing.assert_allclose(run.y, plain.y, atol=1e-5)
         assert run.compiled
         assert run.max_residual[0] < 1e-14
-
-
-# Statuses.
 
 
 NAMES = ["fun", "invariant 'S'", "gradient of invariant 'S'", "event 0"]
@@ -247,16 +235,7 @@ def test_no_value(c, k, compiled):
 def test_a_negative_status_between_the_steps(compiled):
     """The function is called when dense output is evaluated, after the run."""
     status = 0
-
-    def circle(t, y, out, params):
-        out[0], out[1] = y[1], -y[0]
-        return 0
-
-    def square(t, y, value, params):
-        value[0] = y[0] * y[0] + y[1] * y[1]
-        return status
-
-    kept = Invariant(value(square), gradient(twice), name="S")
+    kept = Invariant(value(lambda *given: square(*given) or status), gradient(twice), name="S")
     options = {"method": EIPRK4, "h": 0.1, "dense_output": True, "compiled": compiled}
     run = integrate(value(circle), (0, 1), [1, 2], invariants=kept, **options)
     assert run.compiled == compiled
@@ -276,17 +255,19 @@ def test_a_shorter_step_may_have_a_value(c, compiled):
     same(run, integrate(c.decay, (0, 1), [1.0], **options | {"compiled": not compiled}))
 
 
-# Refused functions.
+@cfunc("intc(f8, CPointer(f8), CPointer(f8), CPointer(f8))")
+def decay(t, y, out, params):
+    out[0] = -y[0]
+    return 0
 
 
-def refused(c):
-    """Return functions given as fun, with the text of the error."""
+def test_refused_functions(c):
     arrays = [NUMBERS] * 3
     double = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double, *arrays)(lambda *arguments: 0.0)
     anything = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_double, *[ctypes.c_void_p] * 3)(lambda *a: 0)
     plain = c.kepler.function
     ffi = cffi.FFI()
-    return [
+    refused = [
         (plain, r"is a bare C function, .*; wrap it: scipy\.LowLevelCallable\(pointer\)"),
         (ctypes.CDLL(None).sin, "is a bare C function"),
         (ffi.callback("int(double, double *)")(lambda *a: 0), "is a bare C function"),
@@ -298,16 +279,7 @@ def refused(c):
         (LowLevelCallable(plain, ctypes.c_void_p(1)), "LowLevelCallable with user_data"),
         (ctypes.cast(plain, ctypes.c_void_p).value, "must be callable"),
     ]
-
-
-@cfunc("intc(f8, CPointer(f8), CPointer(f8), CPointer(f8))")
-def decay(t, y, out, params):
-    out[0] = -y[0]
-    return 0
-
-
-def test_refused_functions(c):
-    for fun, reason in refused(c):
+    for fun, reason in refused:
         with pytest.raises(TypeError, match=reason):
             integrate(fun, (0, 1), Y0, method=EIPRK4, h=0.1, params=MU)
         for wrap in (lambda f: Invariant(f, c.kept_gradient), lambda f: Invariant(c.kept, c.kept, name="H")):
@@ -331,13 +303,7 @@ def test_they_do_not_pickle(c):
         pickle.dumps(kept)
 
 
-# Events.
-
-
-def nearest(t, y, p):
-    return y[0] * y[2] + y[1] * y[3]
-
-
+nearest = partial(turn)
 nearest.direction, nearest.terminal = 1, 3
 
 
@@ -378,9 +344,6 @@ def test_events_in_python_beside_native_functions(c, options, alone):
     assert set(kinds.values()) == {"pointer"}
     with pytest.raises(TypeError, match="is not a Numba function"):
         integrate(**given, **options, compiled=True)
-
-
-# Ensembles and checkpoints.
 
 
 def test_members_are_single_runs(c):

@@ -133,12 +133,8 @@ def sir(t, y):
     return np.array([-2 * y[0] * y[1], 2 * y[0] * y[1] - y[1], y[1]])
 
 
-def first_integral(t, y):
-    return y[2] + np.log(y[0]) / 2
-
-
 MISSING = {  # momenta are found by the energy; without invariants to keep there is no projection to change linear ones
-    "SIR": (sir, [0.9, 0.1, 0.0], first_integral, ["y0 + y1 + y2"]),
+    "SIR": (sir, [0.9, 0.1, 0.0], lambda t, y: y[2] + np.log(y[0]) / 2, ["y0 + y1 + y2"]),
     "SIR alone": (sir, [0.9, 0.1, 0.0], (), ["y0 + y1 + y2"]),
     "pendulum": (pendulum, [1.0, 0.5], ENERGY, []),
 }

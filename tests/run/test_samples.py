@@ -9,24 +9,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BPoly
 from systems import same
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPRK4,
-    EIPRK23,
-    EIPRK45,
-    EIPRKN8,
-    EIPRKN12,
-    Invariant,
-    eip_method,
-    ensemble,
-    integrate,
-)
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPGJ12, EIPRK4, EIPRK23, EIPRK45, EIPRKN8, EIPRKN12, Invariant, ensemble, integrate
 from eip_scipy.methods import NystromTableau
 from eip_scipy.problems import kepler
 
 pytestmark = pytest.mark.needs_jit
-
 STEPS = {
     "RK4": (EIPRK4, {"h": 0.05}),
     "RK23": (EIPRK23, {"rtol": 1e-4}),
@@ -39,23 +27,9 @@ STEPS = {
 methods = pytest.mark.parametrize(("method", "steps"), list(STEPS.values()), ids=list(STEPS))
 NYSTROM = EIPRKN8, EIPRKN12
 PROBLEM = kepler(t_end=30.0)
-
-
-@njit
-def crossing(t, y, params):
-    return y[1]
-
-
-@njit
-def apsis(t, y, params):
-    return y[0] * y[2] + y[1] * y[3]
-
-
-@njit
-def clock(t, y, params):
-    return np.sin(3.0 * t + 0.1)
-
-
+crossing = njit(lambda t, y, params: y[1])
+apsis = njit(lambda t, y, params: y[0] * y[2] + y[1] * y[3])
+clock = njit(lambda t, y, params: np.sin(3.0 * t + 0.1))
 apsis.direction = 1.0
 EVENTS = [crossing, apsis, clock]
 
@@ -155,7 +129,7 @@ NYSTROM4 = NystromTableau(
 )
 
 
-@pytest.mark.parametrize("method", [EIPRK4, eip_method(NYSTROM4)])
+@pytest.mark.parametrize("method", [EIPRK4, eip_scipy.eip_method(NYSTROM4)])
 def test_interpolants_are_hermite_s(method):
     """Interpolation is SciPy's, by values and slopes at both ends; for Nystrom methods by accelerations too."""
     y0, params = PROBLEM.y0, PROBLEM.params
@@ -181,8 +155,6 @@ def test_interpolants_join_the_states_from_which_steps_continue(method):
     looped = integrate(PROBLEM.fun, (0, 3), PROBLEM.y0, compiled=False, linear_invariants=None, **options)
     np.testing.assert_array_equal(stepped.sol(np.linspace(0, 3, 501)), looped.sol(np.linspace(0, 3, 501)))
 
-
-# Output lies on the manifold, however seldom the steps are projected.
 
 SELDOM = {
     "RK4": (EIPRK4, {"h": 0.05, "every": 3}),

@@ -10,19 +10,7 @@ import scipy.integrate
 from systems import refuse
 
 import eip_scipy
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ14,
-    EIPRK4,
-    EIPRK45,
-    EIPRKN12,
-    Diagnostics,
-    Invariant,
-    ProjectionWarning,
-    eip_method,
-    integrate,
-    solve_ivp,
-)
+from eip_scipy import EIPDOP853, EIPGJ14, EIPRK4, EIPRK45, EIPRKN12, Invariant, eip_method, integrate, solve_ivp
 from eip_scipy.problems import kepler
 from eip_scipy.results import OdeResult
 
@@ -50,10 +38,6 @@ def second_fall(t, y, k):
     return y[0] + 0.1
 
 
-def rotation(t, y, k):
-    return 1j * k * y
-
-
 def norm(t, y, k):
     return np.sum(np.abs(y) ** 2)
 
@@ -77,7 +61,7 @@ CASES = {
     "zero sampled": {"t_span": (2, 2), "t_eval": [2], "dense_output": True},
     "vectorized, lists": {"vectorized": True, "t_span": [0, 7], "y0": (1, 0), "args": [K]},
     "multistep": {"method": EIPGJ14, "h": 0.05},
-    "complex": {"fun": rotation, "y0": [1.0, 1j], "invariants": Invariant(norm, twice, name="norm")},
+    "complex": {"fun": lambda t, y, k: 1j * k * y, "y0": [1.0, 1j], "invariants": Invariant(norm, twice, name="norm")},
 }
 
 
@@ -249,24 +233,21 @@ def test_events_are_evaluated_at_the_projected_start():
     np.testing.assert_allclose(sol.t_events[0], [np.arccos(1.05 / 1.1) / np.sqrt(K)], rtol=1e-4)
 
 
-def damped(t, y, k):
-    return spring(t, y, k) - [0.0, 0.5 * y[1]]
-
-
 @pytest.mark.parametrize("stopped", [False, True], ids=["to the end", "by an event"])
 def test_runs_that_are_not_reliable(stopped):
     """The message says so, a warning comes once, and a given record is the result's.
 
     SciPy ends a run at an event without the solver's knowledge: after three steps nothing has been checked before.
     """
-    record = Diagnostics()
+    record = eip_scipy.Diagnostics()
 
     def event(t, y, k):
         return t - 0.12
 
     event.terminal = True
     options = {"args": (K,), "diagnostics": record, "h": 0.05, "method": EIPRK4}
-    with pytest.warns(ProjectionWarning, match="'energy' is not an invariant of this system") as found:
+    damped = lambda t, y, k: spring(t, y, k) - [0.0, 0.5 * y[1]]  # noqa: E731
+    with pytest.warns(eip_scipy.ProjectionWarning, match="'energy' is not an invariant of this system") as found:
         sol = solve_ivp(damped, (0, 20), [1.0, 0.0], invariants=ENERGY, events=event if stopped else None, **options)
     assert len(found) == 1
     assert (sol.status, sol.success, sol.trusted) == (int(stopped), True, False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
-from systems import BALANCES, H_USES_F, QUARTIC_PARAMS, QUARTIC_START, pericentre, same, swinging
+from systems import BALANCES, H_USES_F, QUARTIC_PARAMS, QUARTIC_START, pericentre, same, swinging, twice
 from systems import JIT_H as H
 from systems import JIT_L as L
 from systems import jit_energy as energy
@@ -15,28 +15,19 @@ from systems import jit_momentum as momentum
 from systems import jit_momentum_gradient as momentum_gradient
 from systems import jit_orbit as fun
 
-from eip_scipy import (
-    EIPDOP853,
-    EIPGJ12,
-    EIPGJ14,
-    EIPRK2,
-    EIPRK4,
-    EIPRK5,
-    EIPRK45,
-    EIPRKN12,
-    Invariant,
-    ensemble,
-    integrate,
-)
+import eip_scipy
+from eip_scipy import EIPDOP853, EIPGJ12, EIPGJ14, EIPRK2, EIPRK4, EIPRK5, EIPRK45, EIPRKN12, Invariant, ensemble
 
 pytestmark = pytest.mark.needs_jit
 
 # Kepler: plain, with params, and in place.
-
-
-@njit
-def both(t, y):
-    return np.array([energy(t, y), momentum(t, y)])
+both = njit(lambda t, y: np.array([energy(t, y), momentum(t, y)]))
+energy_of_params = njit(lambda t, y, p: 0.5 * (y[2] * y[2] + y[3] * y[3]) - p[0] / sqrt(y[0] * y[0] + y[1] * y[1]))
+momentum_of_params = njit(lambda t, y, p: y[0] * y[3] - y[1] * y[2])
+attraction = njit(lambda t, q: -q / np.sqrt(q[0] * q[0] + q[1] * q[1]) ** 3)
+crossing, second = (njit(lambda t, y: y[1]) for _ in range(2))
+falling = njit(lambda t, y: y[0])
+falling.direction, second.terminal = -1, 1
 
 
 @njit
@@ -63,28 +54,13 @@ def fun_of_params(t, y, p):
 
 
 @njit
-def energy_of_params(t, y, p):
-    return 0.5 * (y[2] * y[2] + y[3] * y[3]) - p[0] / sqrt(y[0] * y[0] + y[1] * y[1])
-
-
-@njit
 def energy_gradient_in_place(t, y, f, out, p):
     out[0], out[1], out[2], out[3] = -f[2], -f[3], y[2], y[3]
 
 
 @njit
-def momentum_of_params(t, y, p):
-    return y[0] * y[3] - y[1] * y[2]
-
-
-@njit
 def momentum_gradient_in_place(t, y, out, p):
     out[0], out[1], out[2], out[3] = y[3], -y[2], -y[1], y[0]
-
-
-@njit
-def attraction(t, q):
-    return -q / np.sqrt(q[0] * q[0] + q[1] * q[1]) ** 3
 
 
 @njit
@@ -94,18 +70,6 @@ def attraction_gradient(t, q, dq, out):
         out[k] = (3 * q[k] * along / r2 - dq[k]) / r2**1.5
 
 
-@njit
-def crossing(t, y):
-    return y[1]
-
-
-@njit
-def falling(t, y):
-    return y[0]
-
-
-second = njit(crossing.py_func)
-falling.direction, second.terminal = -1, 1
 # A nonlinear Schroedinger lattice.
 
 
@@ -135,11 +99,6 @@ def mass(t, y):
 
 
 @njit
-def mass_gradient(t, y):
-    return 2.0 * y
-
-
-@njit
 def lattice_energy(t, y):
     total, w = 0.0, hop(y)
     for i in range(y.size):
@@ -148,17 +107,10 @@ def lattice_energy(t, y):
     return total
 
 
-@njit
-def lattice_energy_gradient(t, y, f):
-    return 2j * f
-
-
 Z0 = np.exp(1j * np.arange(7.0)) * (1.0 + 0.1 * np.arange(7.0))
-MASS = Invariant(mass, mass_gradient, name="mass")
-ENERGY = Invariant(lattice_energy, lattice_energy_gradient, uses_f=True, name="energy")
+MASS = Invariant(mass, twice, name="mass")
+ENERGY = Invariant(lattice_energy, njit(lambda t, y, f: 2j * f), uses_f=True, name="energy")
 COMPLEX_FRAME = (np.full((1, 7), 1.0 + 0.5j), np.full((7, 1), 0.2 - 0.1j))
-
-
 Y0 = pericentre(0.6)
 H_OF_F = Invariant(energy, njit(H_USES_F.gradient), uses_f=True, name="H")
 HL = Invariant(both, both_gradients, name="HL")
@@ -222,7 +174,7 @@ names = pytest.mark.parametrize(
 
 
 def run(name, **more):
-    return integrate(**USUAL | RUNS[name] | more)
+    return eip_scipy.integrate(**USUAL | RUNS[name] | more)
 
 
 @names

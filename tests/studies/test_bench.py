@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from pages import printed_tables
+from pages import printed_tables, read_rows
 from scipy.integrate import solve_ivp
 
 from eip_scipy_studies.bench.cases import CASES
@@ -107,10 +106,9 @@ def test_a_package_that_fails_is_a_row():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_command_writes_runs_and_page(tmp_path):
     assert main(["bench", "double pendulum", "--solvers", "SciPy DOP853", "--out", str(tmp_path), "--quiet"]) == 0
-    rows = list(csv.DictReader((tmp_path / "bench.csv").read_text(encoding="utf-8").splitlines()))
+    rows = read_rows(tmp_path / "bench.csv")
     errors = [float(row["error"]) for row in rows]
     assert errors[0] > 1e-6
     assert errors[-1] < 1e-9
@@ -118,13 +116,11 @@ def test_command_writes_runs_and_page(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("group", ["eigenstates", "Hénon-Heiles", "Huber"])
 def test_metric_on_the_page(group, tmp_path):
     (printed,) = (table[group] for table in printed_tables("explanation/metric.md") if group in table)
     assert main(["bench", "metric", "--only", group, "--out", str(tmp_path), "--quiet"]) == 0
-    rows = csv.DictReader((tmp_path / "metric.csv").read_text(encoding="utf-8").splitlines())
-    own = [row for row in rows if row["group"] == group]
+    own = [row for row in read_rows(tmp_path / "metric.csv") if row["group"] == group]
     assert int(printed[0]) == len(own)
     *means, ratios = (np.array([float(row[key]) for row in own]) for key in ("none", "euclidean", "default", "ratio"))
     assert [float(x) for x in printed[1:4]] == pytest.approx([np.exp(np.log(x).mean()) for x in means], rel=0.1)

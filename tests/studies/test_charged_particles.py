@@ -45,7 +45,6 @@ COLUMNS = {"uniform": UNIFORM, "tokamak-banana": BANANA, "tokamak-transit": BANA
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.needs_jit
 @pytest.mark.parametrize("scene", study.SCENES)
 def test_numbers_of_the_page(scene):
@@ -62,7 +61,6 @@ def test_numbers_of_the_page(scene):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.needs_jit
 def test_numbers_of_longer_steps_on_the_page():
     problem = tokamak("transit")

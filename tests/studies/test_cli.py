@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import sys
 import warnings
 from importlib import import_module
 from pathlib import Path
@@ -86,8 +87,8 @@ def test_status_and_files(then, status, err, tmp_path, capsys):
     assert err in printed.err
 
 
-@pytest.mark.usefixtures("no_plotting")
-def test_without_matplotlib_the_rest_is_done(tmp_path, capsys):
+def test_without_matplotlib_the_rest_is_done(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert run("sums", sums, ["--out", str(tmp_path)]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["sums.csv"]
     assert 'no figures without matplotlib: pip install "eip_scipy[plot]"' in capsys.readouterr().err

@@ -9,29 +9,14 @@ from scipy.integrate import solve_ivp
 from systems import pericentre
 
 from eip_scipy.problems import Grid, GrossPitaevskii
-from eip_scipy_studies.comparators import (
-    boris,
-    crank_nicolson,
-    implicit_midpoint,
-    linearly_implicit,
-    sav_crank_nicolson,
-    stormer_verlet,
-)
+from eip_scipy_studies import comparators as schemes
 from eip_scipy_studies.condensates.problems import plane_wave, rotating_packet, soliton
 
-SCHEMES = (crank_nicolson, linearly_implicit, sav_crank_nicolson)
+SCHEMES = (schemes.crank_nicolson, schemes.linearly_implicit, schemes.sav_crank_nicolson)
 ORBIT, Y0 = pericentre(0.5), np.array([0.5, 1.0, 0.2, 0.3, -0.1, 0.25])
 OTHER = {"form": "drift-kick-drift"}
-
-
-@njit
-def kepler(t, q):
-    return -q / (q[0] ** 2 + q[1] ** 2) ** 1.5
-
-
-@njit
-def scaled(t, q, params):
-    return -params[0] * q
+kepler = njit(lambda t, q: -q / (q[0] ** 2 + q[1] ** 2) ** 1.5)
+scaled = njit(lambda t, q, params: -params[0] * q)
 
 
 @njit
@@ -62,12 +47,12 @@ def gyrated(t, omega):
 @pytest.mark.parametrize(
     ("method", "fun", "t_end", "y0", "exact", "n", "options"),
     [
-        (stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, {}),
-        (stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, OTHER),
-        (stormer_verlet, scaled, 10.0, [1.0, 0.0], [math.cos(30), -3 * math.sin(30)], 4000, {"params": [9.0]}),
-        (boris, crossed, 5.0, Y0, gyrated(5.0, -3.0), 1000, {"mass": 2.0, "charge": -3.0, "params": [0.0, 2.0]}),
-        (implicit_midpoint, oscillator, 10.0, [1.0, 0.0], [math.cos(10), -math.sin(10)], 100, {}),
-        (implicit_midpoint, driven, 3.0, [0.0], [math.sin(6.0)], 1000, {"params": [2.0]}),
+        (schemes.stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, {}),
+        (schemes.stormer_verlet, kepler, 2 * np.pi, ORBIT, ORBIT, 4000, OTHER),
+        (schemes.stormer_verlet, scaled, 10.0, [1.0, 0.0], [math.cos(30), -3 * math.sin(30)], 4000, {"params": [9.0]}),
+        (schemes.boris, crossed, 5.0, Y0, gyrated(5.0, -3.0), 1000, {"mass": 2.0, "charge": -3.0, "params": [0, 2]}),
+        (schemes.implicit_midpoint, oscillator, 10.0, [1.0, 0.0], [math.cos(10), -math.sin(10)], 100, {}),
+        (schemes.implicit_midpoint, driven, 3.0, [0.0], [math.sin(6.0)], 1000, {"params": [2.0]}),
     ],
 )
 def test_order_two_reversible_and_the_same_bits_interpreted(method, fun, t_end, y0, exact, n, options):
@@ -82,7 +67,7 @@ def test_order_two_reversible_and_the_same_bits_interpreted(method, fun, t_end, 
     np.testing.assert_array_equal(compiled.y, interpreted.y)
     assert compiled.nfev == interpreted.nfev
     np.testing.assert_allclose(compiled.t[:-1], 0.3 + 0.21 * np.arange(compiled.t.size - 1))
-    if method is not implicit_midpoint:  # reversible to round-off, if the last step is not shorter
+    if method is not schemes.implicit_midpoint:  # reversible to round-off, if the last step is not shorter
         back = method(fun, (t_end, 0.0), runs[0].y[:, -1], t_end / n, **options)
         np.testing.assert_allclose(back.y[:, -1], y0, rtol=0, atol=1e-11)
 
@@ -99,7 +84,7 @@ def modulated(shape=(16, 16), beta=1.0):
 def test_order_two_of_fields(scheme):
     ring, packet = soliton(), rotating_packet(0.9, points=32)
     cases = [(ring.equation, ring.y0, 1.0, 1e-2), (*modulated(), 0.5, 5e-3)]
-    if scheme is not sav_crank_nicolson:
+    if scheme is not schemes.sav_crank_nicolson:
         cases.append((packet.equation, packet.y0, 0.1, 1e-3))
     for gpe, psi, t_end, h in cases:
         fine = solve_ivp(gpe.fun, (0, t_end), psi, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
@@ -118,13 +103,13 @@ def test_invariants_of_the_schemes():
         run = scheme(gpe, (0, 2), psi0, 0.01, save_every=1)
         values = [np.array([value(psi) for psi in run.y.T]) for value in (gpe.mass, gpe.energy)]
         changes[scheme] = [np.abs(value / value[0] - 1).max() for value in values]
-        if scheme is linearly_implicit:
+        if scheme is schemes.linearly_implicit:
             quadratic, density = np.array([free.energy(psi) for psi in run.y.T]), abs(run.y) ** 2
             mixed = gpe.grid.cell * np.sum(density[:, 1:] * density[:, :-1], axis=0)
             assert np.ptp(0.5 * (quadratic[1:] + quadratic[:-1]) + 0.5 * gpe.beta * mixed) < 1e-8
-    assert changes[crank_nicolson][0] < 1e-9 > changes[crank_nicolson][1]
-    assert changes[linearly_implicit][0] < 1e-9 < 1e-7 < changes[linearly_implicit][1]
+    assert changes[schemes.crank_nicolson][0] < 1e-9 > changes[schemes.crank_nicolson][1]
+    assert changes[schemes.linearly_implicit][0] < 1e-9 < 1e-7 < changes[schemes.linearly_implicit][1]
     assert run.modified_energy[0] == pytest.approx(values[1][0], rel=1e-14)
     assert np.ptp(run.modified_energy) < 1e-12 * values[1][0]
-    assert changes[sav_crank_nicolson][1] > 1e-7
+    assert changes[schemes.sav_crank_nicolson][1] > 1e-7
     assert run.nfev == 201  # the first step twice

@@ -6,8 +6,6 @@ from orders import observed_order
 
 from eip_scipy import EIPDOP853, eip_method, integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
-
-pytest.importorskip("numba")
 from eip_scipy_studies.condensates.ground_state import ground_state, imprint, polygon, ring_start, thomas_fermi
 from eip_scipy_studies.condensates.problems import harmonic_trap, quartic_trap
 from eip_scipy_studies.condensates.splitting import Splitting

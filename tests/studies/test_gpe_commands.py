@@ -1,11 +1,11 @@
 """`eip-scipy gpe` on small grids: interruptions, and states that do not belong."""
 
-import csv
 from dataclasses import replace
 from itertools import count
 
 import numpy as np
 import pytest
+from pages import read_rows
 
 from eip_scipy import integrate
 from eip_scipy.problems import Grid, GrossPitaevskii
@@ -17,11 +17,6 @@ from eip_scipy_studies.output import Output
 from eip_scipy_studies.report import UsageError
 
 pytestmark = pytest.mark.needs_jit
-
-
-def read(file):
-    with open(file, newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def small_ring(kappa=0.3):
@@ -41,7 +36,6 @@ def run(out, start, checkpoint=None, resume=False):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.usefixtures("snapshots")
 @pytest.mark.parametrize(("broken", "evaluation", "done"), [(0, 207, set()), (2, 93, {"EIP-M"})])
 def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, start, capsys, monkeypatch):
@@ -69,7 +63,7 @@ def test_an_interrupted_command_goes_on(broken, evaluation, done, tmp_path, star
     assert {row["method"] for row in out.numbers.get("errors", ())} == done
     run(Output(tmp_path / "second"), start, checkpoint=folder, resume=True)
     assert {path.stem for path in folder.iterdir()} == {*quench.METHODS, quench.REFERENCE}
-    assert read(tmp_path / "second" / "ring.csv") == read(tmp_path / "whole" / "ring.csv")
+    assert read_rows(tmp_path / "second" / "ring.csv") == read_rows(tmp_path / "whole" / "ring.csv")
 
 
 def test_states_that_do_not_belong(start, tmp_path):

@@ -4,18 +4,16 @@ The ring to t = 10 and the vortex lines to t = 20 take longer: they run to t = 1
 checked.
 """
 
-import csv
-
 import numpy as np
 import pytest
-from pages import PAGES, assert_printed, printed_tables
+from pages import PAGES, assert_printed, printed_tables, read_rows
 
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.comparators import crank_nicolson, linearly_implicit
 from eip_scipy_studies.condensates import efficiency, quench, states
 from eip_scipy_studies.output import Output
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 PAGE = "results/gross-pitaevskii.md"
 TRAP, RING, LINES, EFFICIENCY = 1, 2, 4, 6  # numbers of the tables
 TEXT = " ".join((PAGES / PAGE).read_text(encoding="utf-8").split())
@@ -68,8 +66,7 @@ def test_vortex_lines(tmp_path):
     assert main(["gpe", "vortex-lines", "--t-end", "0.4", "--out", str(tmp_path), "--quiet"]) == 0
     names = {"vortex-lines.csv", *(f"vortex-lines-{name}.png" for name in ("slices", "surfaces", "errors"))}
     assert {path.name for path in tmp_path.iterdir()} == names
-    with open(tmp_path / "vortex-lines.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_rows(tmp_path / "vortex-lines.csv")
     for name, (_, _, _, whole) in printed_tables(PAGE)[LINES].items():
         assert max(float(row["field_error"]) for row in rows if row["method"] == name) < float(whole)
 
@@ -78,8 +75,7 @@ def test_efficiency(tmp_path):
     out = Output(tmp_path, quiet=True)
     efficiency.efficiency(out, repeats=1)
     assert out.passed, out.numbers["checks"]
-    with open(tmp_path / "fig-efficiency.csv", newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["wave"] == "modulated wave"]
+    rows = [row for row in read_rows(tmp_path / "fig-efficiency.csv") if row["wave"] == "modulated wave"]
     assert any("rank 1" in row["remark"] for row in rows if row["method"] == "EIP-ME")
     for name, (h, error, mass, energy, pairs, _) in printed_tables(PAGE)[EFFICIENCY].items():
         row = min((row for row in rows if row["method"] == name), key=lambda row: abs(float(row["h"]) - float(h)))

@@ -1,6 +1,5 @@
 """The hard cases: gradients, invariance, final states, and the command ``eip-scipy hard-cases``."""
 
-import csv
 import json
 import math
 import pickle
@@ -8,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pages import read_rows
 from scipy.integrate import solve_ivp
 
 from eip_scipy import Invariant, check_gradient, recommend
@@ -84,8 +84,7 @@ def test_command_prints_and_writes(tmp_path, capsys):
     found = json.loads(file.read_text())
     assert (found["rtol"], found["atol"]) == (1e-9, pytest.approx(1e-12))
     assert [check["passed"] for check in found["checks"]] == [True, True, True, False, True]
-    with open(tmp_path / "hard-cases-EIPDOP853-error.csv", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = read_rows(tmp_path / "hard-cases-EIPDOP853-error.csv")
     assert [row["case"] for row in rows] == few
     assert float(rows[1]["gain"]) == found["cases"][1]["gain"] < 1
     assert found["cases"][1]["rank_reduced"] > 100
@@ -93,10 +92,8 @@ def test_command_prints_and_writes(tmp_path, capsys):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "mean", "worst", "losses"),
-    [("EIPRK23", 73, 1.01, 1), ("EIPRK45", 28, 1.5, 1), ("EIPDOP853", 18, 32, 3)],
+    ("method", "mean", "worst", "losses"), [("EIPRK23", 73, 1.01, 1), ("EIPRK45", 28, 1.5, 1), ("EIPDOP853", 18, 32, 3)]
 )
 def test_gains_on_the_pages(method, mean, worst, losses, tmp_path):
     """As the pages on choosing a method and on the metric say; round-off decides on the last losses."""
@@ -115,7 +112,6 @@ def test_gains_on_the_pages(method, mean, worst, losses, tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(("wanted", "near"), [(1e-4, 31), (1e-6, 33), (1e-8, 35)])
 def test_errors_on_the_page_on_recommend(wanted, near):
     found, expected = [], []

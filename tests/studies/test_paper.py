@@ -1,10 +1,10 @@
 """``eip-scipy reproduce``: the paper's tables against its numbers and 50 digits, and figures 1 and 2."""
 
-import csv
 import json
 
 import numpy as np
 import pytest
+from pages import read_rows
 
 from eip_scipy import EIPDOP853, EIPRK4, EIPRK5, EIPRK45, integrate
 from eip_scipy.problems import kepler
@@ -28,11 +28,6 @@ APART = {
 ROUNDINGS = {1: EPS / 10, 2: 1.5e-15, 3: 1e-14, 4: 3e-16}  # of the invariants; step by step of y in table 3
 
 
-def read(file):
-    with open(file, newline="") as stream:
-        return list(csv.DictReader(stream))
-
-
 def test_numbers_agree_to_the_printed_digits_except_where_listed():
     """All errors are those in 50 digits, up to round-off."""
     cells, found = [row for s in EXACT for row in tables.rows_of(s, tables.errors(s))], {}
@@ -51,7 +46,6 @@ def test_numbers_agree_to_the_printed_digits_except_where_listed():
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize("series", [s for s in SERIES if s["table"] == 5], ids=lambda series: series["name"])
 def test_table_5(series):
     """As the page on condensates says: all but two errors, of 3.5e-13, agree to three digits or more."""
@@ -74,7 +68,7 @@ def test_command_prints_and_writes(tmp_path, capsys):
     assert (written["passed"], len(written["cells"]), len(written["orders"])) == (True, 40, 30)
     (misprint,) = (cell for cell in written["cells"] if cell["misprinted_as"] is not None)
     assert (misprint["row"], misprint["column"], misprint["paper"]) == ("RK2 iter#1", "h0/1", 31.922)
-    lines = read(tmp_path / "new" / "table1.csv")
+    lines = read_rows(tmp_path / "new" / "table1.csv")
     assert len(lines) == 28
     assert float(lines[0]["ours"]) == pytest.approx(6.3506e-3, rel=1e-4)
 
@@ -92,7 +86,7 @@ def test_short_runs_of_figures_1_and_2(tmp_path, monkeypatch):
     orbits.kepler_figures(out)
     assert {path.name for path in tmp_path.iterdir()} == {"fig-kepler.csv", *orbits.FIGURES}
     assert [check["passed"] for check in out.numbers["checks"]] == [False, False, False, True]
-    last = {row["method"]: row for row in read(tmp_path / "fig-kepler.csv")}
+    last = {row["method"]: row for row in read_rows(tmp_path / "fig-kepler.csv")}
     energy, momentum, position = (
         {name: float(row[f"{kind}_error"]) for name, row in last.items()} for kind in ("energy", "momentum", "position")
     )
@@ -103,16 +97,14 @@ def test_short_runs_of_figures_1_and_2(tmp_path, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 def test_figures_1_and_2(tmp_path):
     """Kept invariants prove nothing about the orbit: RK2's is lost, RK5's is not."""
     assert main(["reproduce", "fig-kepler", "--out", str(tmp_path)]) == 0
-    last = {row["method"]: float(row["position_error"]) for row in read(tmp_path / "fig-kepler.csv")}
+    last = {row["method"]: float(row["position_error"]) for row in read_rows(tmp_path / "fig-kepler.csv")}
     assert last["EIP-HL, RK5"] < 1e-3 < 0.5 < last["EIP-HL, RK2"]
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "setting", "evaluations"),
     [

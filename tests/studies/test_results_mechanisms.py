@@ -11,7 +11,7 @@ from eip_scipy import EIPDOP853, integrate
 from eip_scipy_studies.bench.cases import CASES
 from eip_scipy_studies.bench.mechanisms import four_bar, n_four_bar
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 LINKAGE, WINDOW = printed_tables("how-to/mechanisms.md")[1:3]
 
 

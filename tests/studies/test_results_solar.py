@@ -1,12 +1,12 @@
 """The numbers of the pages about planets are computed again, within the spread that the pages state."""
 
-import csv
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import read_rows
 from scipy.spatial.transform import Rotation
 from systems import YEAR_D
 
@@ -16,7 +16,7 @@ from eip_scipy.problems import comet, figure_eight, kepler, pythagorean, solar_s
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import comparison, runs
 
-pytestmark = [pytest.mark.nightly, pytest.mark.slow, pytest.mark.needs_jit]
+pytestmark = [pytest.mark.nightly, pytest.mark.needs_jit]
 KEPT = {"every": 10, "compensated": True}
 MERCURY, VENUS, EARTH, MARS, JUPITER = 0, 1, 2, 3, 4
 
@@ -161,8 +161,8 @@ def test_compensated_sums():
 
 def test_what_each_force_is_worth(kernel, tmp_path):
     assert main(["solar-system", "--truth", "--out", str(tmp_path), "--quiet"]) == 0
-    with open(tmp_path / "solar-truth.csv", newline="") as stream:
-        km = {(row["model"], float(row["years"]), row["body"]): float(row["km"]) for row in csv.DictReader(stream)}
+    rows = read_rows(tmp_path / "solar-truth.csv")
+    km = {(row["model"], float(row["years"]), row["body"]): float(row["km"]) for row in rows}
     for model, *cells in page("reference/forces.md", "| model | Mercury"):
         for body, cell in zip(("Mercury", "EMB", "Mars", "Jupiter"), cells, strict=True):
             found = [km[model, years, body] for years in (1.0, 10.0, 100.0)]

@@ -1,12 +1,12 @@
 """``eip-scipy solar-system``: a short run with all of its files, stored states, checkpoints, epochs, force models."""
 
-import csv
 import json
 import math
 import sys
 from fractions import Fraction
 
 import pytest
+from pages import read_rows
 
 from eip_scipy_studies.cli import main
 from eip_scipy_studies.solar import command, cost, runs
@@ -21,14 +21,16 @@ def solar(folder, *words):
     status = main(["solar-system", *words, "--out", str(folder), "--json", str(folder / "run.json")])
     rows = {}
     for file in folder.glob("*.csv"):
-        with open(file, newline="") as stream:
-            rows[file.stem] = [{k: v for k, v in row.items() if "wall" not in k} for row in csv.DictReader(stream)]
+        rows[file.stem] = [{k: v for k, v in row.items() if "wall" not in k} for row in read_rows(file)]
     return status, rows
 
 
 @pytest.fixture
-def few_methods(no_rebound, monkeypatch):
+def few_methods(monkeypatch):
     """Run less than the command would: no REBOUND, no figures."""
+    monkeypatch.setitem(sys.modules, "rebound", None)
+    monkeypatch.delitem(sys.modules, "eip_scipy.integrations.rebound", raising=False)
+    monkeypatch.delattr("eip_scipy.integrations.rebound", raising=False)
     monkeypatch.setattr(command, "FIGURES", ())
 
 
@@ -57,7 +59,6 @@ def test_short_run_with_everything(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.slow
 @pytest.mark.usefixtures("few_methods")
 def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
     """With --checkpoint, completed runs are not repeated; the numbers are those of an uninterrupted command."""
@@ -83,9 +84,6 @@ def test_an_interrupted_command_goes_on(tmp_path, capsys, monkeypatch):
     assert solar(tmp_path / "again", *words)[0] == 2
     assert solar(tmp_path / "second", *words, "--resume") == whole
     assert {name: (folder / name).read_bytes() for name in before} == before
-
-
-# Epochs.
 
 
 @pytest.mark.parametrize(
