@@ -45,16 +45,6 @@ def kepler_by_arrays(t, y):
     return 0.5 * np.sum(y[2:] ** 2) - 1.0 / np.sqrt(y[:2] @ y[:2])
 
 
-@case(lambda a, b, c, d: ((a + c / 2 - 3) / c) ** 2 + ((b + d / 2 - 3) / d) ** 2, gate=True)
-def arrays_changed_in_place(t, y):
-    x = y[:2] * 1.0
-    x += y[2:] / 2.0
-    x -= 3.0
-    x /= y[2:]
-    x *= x
-    return x.sum()
-
-
 @case(
     lambda a, b, c, d: mpmath.exp(-a * b) + mpmath.expm1(c) * mpmath.tanh(d) + mpmath.log(c) + mpmath.log1p(a),
     gate=True,
@@ -111,11 +101,15 @@ def computed(fun, y, extra=()):
     return InvariantSet(Invariant(fun), 0.0, y, np.ones_like(y), 1.0, extra).gradients(0.0, y, y)
 
 
-@case(lambda a, b, c, d: (a / c - b / c + c * a + c - b * d / 2) ** 2, gate=True)
+@case(lambda a, b, c, d: (a / c - b / c + c * a + c - b * d / 2) ** 2 + ((a + c / 2 - 3) * b / c) ** 2, gate=True)
 def arrays_and_a_number_that_varies(t, y):
-    q = y[:2]
+    q = y[:2] * 1.0
     one, two, three = -q / y[2], y[2] * q, y[2] - q * y[3] / 2.0
-    return (two[0] + three[1] + one[1] - one[0]) ** 2
+    q += y[2:] / 2.0
+    q -= 3.0
+    q /= y[2:]
+    q *= y[1]
+    return (two[0] + three[1] + one[1] - one[0]) ** 2 + q[0] ** 2
 
 
 @case(

@@ -1,14 +1,16 @@
-"""The options of the projection are known in one place: signatures, documentation, keywords."""
+"""Options of the projection in signatures, documentation and keywords; attributes of SciPy that methods use."""
 
 import inspect
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from systems import SQUARE, oscillator
 
-from eip_scipy import EIPRK4, EIPRK45, ensemble, integrate
+from eip_scipy import EIPBDF, EIPRK4, EIPRK45, EIPRadau, ensemble, integrate
 from eip_scipy.core.projection import ProjectionKeywords, ProjectionOptions
 from eip_scipy.ensembles.ensemble import EnsembleKeywords
+from eip_scipy.methods import implicit
 from eip_scipy.problems import kepler
 from eip_scipy.solvers import EIPSolver
 
@@ -48,3 +50,15 @@ def test_solve_ivp_compensates_as_integrate_does(options, kept):
     run = integrate(p.fun, (0, 3), p.y0, compensated=True, compiled=False, **options)
     np.testing.assert_array_equal(sol.y[:, -1], run.y[:, -1])
     assert np.any(solve_ivp(p.fun, (0, 3), p.y0, **options).y[:, -1] != sol.y[:, -1])
+
+
+@pytest.mark.parametrize("method", [EIPRadau, EIPBDF])
+def test_private_names_of_scipy(method, monkeypatch):
+    """All used attributes exist, and a version of SciPy that lacks one is named."""
+    inner = method.TABLEAU.solver
+    solver = inner(oscillator, 0.0, [1.0, 0.0], 1.0)
+    solver.step()
+    assert all(hasattr(solver, name) for name in (*implicit.PRIVATE[inner], "jac_factor", "max_step"))
+    monkeypatch.setitem(implicit.PRIVATE, inner, ("D", "f", "lost"))
+    with pytest.raises(NotImplementedError, match=rf"EIP{inner.__name__} uses .*not have: .*lost\. Use another"):
+        solve_ivp(oscillator, (0, 1), [1.0, 0.0], method=method, invariants=SQUARE)

@@ -200,12 +200,8 @@ def in_turn(t, y):
 def crystal():
     """Atoms on a ring at equal distances: forces cancel up to rounding at the start."""
 
-    sites, side = 1.3 * np.arange(30), 39.0
-
     def both(y):
-        q = sites + y[:30]
-        d = np.roll(q, -1) - q
-        return d - side * np.round(d / side)
+        return np.diff(1.3 * np.arange(31) + np.append(y[:30], y[0]))
 
     def fun(t, y):
         pull = 24 * (both(y) ** -7 - 2 * both(y) ** -13)
