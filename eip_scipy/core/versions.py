@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 __all__ = ["VERSION", "installed"]
 
-VERSION = "0.4.0.dev0"
+VERSION = "0.4.0"
 """Version of the package. pyproject.toml reads it from here; a test compares CITATION.cff and CHANGELOG.md with it."""
 
 
