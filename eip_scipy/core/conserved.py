@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
-from itertools import pairwise, product
+from itertools import combinations, pairwise, product
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from ..engine.native import BUILD, LibraryFunction
 from ..methods.base import PROJECTION_ONLY
 from .derivatives import NumericalGradient, time_of_motion, typical_sizes, unless_error
 from .invariants import Invariant
-from .particles import LinearInvariants, particle_invariants
+from .particles import LinearInvariants
 from .problem import component_names
 
 if TYPE_CHECKING:
@@ -389,9 +389,11 @@ def _masses(states: Iterator[tuple[Array, Array, Array]], row: int, d: int) -> A
 
 def _momenta(masses: Array, d: int, y: Array) -> Array:
     """Return the gradients of the momentum and the angular momentum of particles at the state y."""
-    (item,) = particle_invariants(masses, d)
-    assert item.linear is not None
-    assert item.gradient is not None
-    slope = np.empty((1 if d == 2 else 3, y.size))
-    item.gradient(0.0, y, slope)
-    return np.concatenate([item.linear.C[d:], slope])
+    planes = list(combinations(range(d), 2))
+    m_q, m_v = masses[:, None] * y.reshape(2, -1, d)
+    rows = np.zeros((d + len(planes), 2, masses.size, d))
+    for a in range(d):
+        rows[a, 1, :, a] = masses
+    for row, (a, b) in zip(rows[d:], planes, strict=True):
+        row[0, :, a], row[0, :, b], row[1, :, b], row[1, :, a] = m_v[:, b], -m_v[:, a], m_q[:, a], -m_q[:, b]
+    return rows.reshape(len(rows), -1)

@@ -154,9 +154,14 @@ class Examiner:
             for _ in range(HALVINGS):
                 middle = point((left.share + right.share) / 2)
                 left, right = max((left, middle), (middle, right), key=_change)
-            if (jump := _change((left, right))) > least:
-                where = f"{kept.names[k]!r} jumps by {jump:.2g} at t={left.t:.6g}, so that it is not an invariant there"
-                return f"{where}; make it continuous, for instance by a shift of a potential that is cut off"
+                if not _change((left, right)) > least:
+                    break
+            else:
+                where = f"{kept.names[k]!r} jumps by {_change((left, right)):.2g} at t={left.t:.6g}"
+                return (
+                    f"{where}, so that it is not an invariant there; make it continuous, for instance by a shift of a "
+                    "potential that is cut off"
+                )
         return None
 
 
