@@ -84,6 +84,9 @@ class BoundProblem:
         self.acc, self.jacobian, self.jac, self.variations = acc, jacobian, jac, variations
         self.tangents = NO_TANGENT_VECTORS if variations is None else variations.tangents
         self.n = self.tangents.state(y0).size
+        if problem is not None and problem.y0 is not None and self.n != (size := np.size(problem.y0)):
+            # Compiled functions would read and write memory beyond the state.
+            raise ValueError(f"y0 has {self.n} components, and the problem {problem.name!r} has {size}.")
         self.vectorized, self._explains = vectorized, explains
         self.parameters = floats(extra)
         self.second_order, self._in_place = form.startswith("acceleration"), form.endswith("in place")

@@ -37,7 +37,7 @@ def numbers(line):
         ("trajectory_fit", r"off by (\S+) errors\n6 runs, mean square of the residuals (\S+)", (3.0, 1.2)),
         ("linkage", r"ends 1.4e\+00 m from its pivot\n.* kept: the last link ends (\S+) m", (1e-10,)),
         ("course", r"kepler by EIPRK4: energy off by (\S+), state by (\S+)", (1e-12, 1e-3)),
-        pytest.param("crystal", r"kept: .* by (\S+) of -582, .* by (\S+)", (1e-7, 5e-4), marks=pytest.mark.nightly),
+        pytest.param("crystal", r"kept: .* by (\S+) of -504, .* by (\S+)", (1e-9, 1e-5), marks=pytest.mark.nightly),
         pytest.param(
             "stiff_systems", r"magnet +\S+ +(\S+) .*\nchain +\S+ +(\S+) ", (5e-9, 1e-6), marks=pytest.mark.nightly
         ),

@@ -300,6 +300,7 @@ WRONG = [
     (lambda: start(ParticleField(lambda x, y, z: (x, y))), ValueError, "shape"),
     (lambda: start(ParticleField(lambda x, y, z: (x, y, math.inf))), ValueError, "finite"),
     (lambda: tokamak("bananna"), ValueError, "banana"),
+    (lambda: integrate(tokamak(), (0, 9), np.ones(5), method=EIPRK4), ValueError, "y0 has 5 components"),
     (lambda: ring(electric=None), ValueError, "a field that varies needs electric"),
     (lambda: moving(ring(), form="canonical"), ValueError, "a field that varies needs form='velocity'"),
     (lambda: moving(UNIFORM, "energy", form="canonical"), ValueError, "balances need form='velocity'"),

@@ -9,6 +9,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import OptimizeResult
 
 from ...core.inputs import real_array, shown
 from ...core.problem import Problem
@@ -165,6 +166,8 @@ def transits(run: Any, star: int | str = 0, axis: Sequence[float] = (0, 0, 1)) -
     """
     if isinstance(run, Problem):
         raise TypeError("transits: expected a result of integrate, got a problem; call integrate(problem, ...) first.")
+    if isinstance(run, OptimizeResult) and "_origin" not in vars(run):
+        raise TypeError("transits: a result that was loaded has no functions; take the transits before saving it.")
     names, origin = bodies_of(run).names, vars(run)["_origin"]
     if star not in (*names, *range(len(names))):
         raise ValueError(f"transits: star must be an index below {len(names)} or one of {names}, got {shown(star)}.")
