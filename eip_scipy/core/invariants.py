@@ -79,8 +79,8 @@ class Invariant:
 
     Notes
     -----
-    Every Runge-Kutta method keeps linear invariants. Do not list them as invariants. `integrate` finds them in compiled
-    functions, and the option ``linear_invariants`` takes them, so that the corrections do not change them.
+    Every Runge-Kutta method keeps linear invariants by itself, so that they need not be listed. `integrate` finds them
+    in compiled functions, and the option ``linear_invariants`` takes them, so that corrections do not change them.
 
     C functions are given as `scipy.LowLevelCallable`, of the signatures
     ``int I(double t, const double *y, double *values, const double *params)`` and
