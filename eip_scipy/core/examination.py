@@ -140,8 +140,8 @@ class Examiner:
     def _jump(self, rhs: Derivative, chord: Callable[[float], tuple[float, Array]]) -> str | None:
         """Return a sentence if the invariant with the largest correction jumps on a step's chord, or None.
 
-        Its rate is 0 on both sides of a jump. Where it changes most beside its gradient, a part of the chord is halved
-        until only a jump can be left.
+        The rate of the invariant is 0 on both sides of a jump. Of a part of the chord, the half is kept in which the
+        value changes most by what its gradients do not explain, until only a jump can be left.
         """
         k, kept = int(self.figures[:, data.NU].argmax()), self.invariants
 
@@ -176,7 +176,7 @@ class Point(NamedTuple):
 
 
 def _change(ends: tuple[Point, Point]) -> float:
-    """Return by how much the value changes between two points, beside what the gradients there explain."""
+    """Return the part of a change of value between two points that the gradients there do not explain."""
     one, two = ends
     explained = np.vdot(one.gradient + two.gradient, two.y - one.y).real / 2
     return abs(two.value - one.value - float(explained))

@@ -68,7 +68,7 @@ class SolverClass(type):
     """Metaclass of the solver classes. It makes the classes that `eip_method` returns picklable."""
 
 
-# What the docstring of each method ends with; the example is left out where there is another one.
+# The end of the docstring of each method; the example is left out where there is another one.
 SEE = """
     See Also
     --------

@@ -122,7 +122,7 @@ def transit_times(out: Output, *, years: float = 10.0) -> None:
     Parameters
     ----------
     years : float
-        Length of the runs. Ten years take some 15 minutes.
+        Length of the runs. Ten years take ten minutes.
     """
     rows: list[dict[str, Any]] = []
 
